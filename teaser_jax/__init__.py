@@ -1,0 +1,16 @@
+"""Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
+
+from teaser_jax import metrics, synthetic
+from teaser_jax.problem import make_problem, stack_problems
+from teaser_jax.profile import Profile, profile
+from teaser_jax.register import Registration, register
+from teaser_jax.solve import refit, select, solve
+from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Pose", "Problem", "Profile", "Registration", "Selection", "Settings", "Solution", "Status",
+    "make_problem", "metrics", "profile", "refit", "register", "select", "solve", "stack_problems",
+    "synthetic",
+]  # fmt: skip

@@ -1,0 +1,244 @@
+"""Problems from arrays: validation, defaults, padding and stacking.
+
+Validation lives here and not in the records: JAX rebuilds records all the time, also from
+placeholders that are no arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from teaser_jax.types import Problem
+
+
+def make_problem(
+    src: Any,
+    dst: Any,
+    *,
+    noise_bound: Any,
+    scale: Any = 1.0,
+    cbar2: Any = 1.0,
+    mask: Any = None,
+    confidence: Any = None,
+    pairs: Any = None,
+) -> Problem:
+    """A registration problem from matched points: row i of ``src`` belongs to row i of ``dst``.
+
+    Concrete arrays are checked in full. On traced arrays only shapes and dtypes are checked, and
+    rows that cannot be used (NaN, infinity, bounds not above 0) are left out while solving.
+
+    Args:
+        src, dst: (n, 3) points, any real dtype; integers become floats.
+        noise_bound: Largest error of a right match [length unit of the points], one number or (n,).
+        scale: The known scale [-], or None: estimate it.
+        cbar2: Truncation of the cost, c-bar squared [-].
+        mask: (n,) rows to use.
+        confidence: (n,) weights >= 0 of the matches in the final fit; 0 equals masked.
+        pairs: (m, 2) index pairs to compare, or a ``networkx.Graph`` on row numbers; None: all.
+
+    Returns:
+        A pytree for ``solve``; its dtype is that of the points (float32 unless JAX's x64 is on).
+
+    Raises:
+        ValueError: With what was received and what to do.
+
+    Gradients: exact in ``src``, ``dst``, ``noise_bound``, ``scale`` and ``confidence``.
+    """
+    src, dst = _points(src, "src"), _points(dst, "dst")
+    if src.shape[0] != dst.shape[0]:
+        raise ValueError(
+            f"src has {src.shape[0]} rows and dst has {dst.shape[0]}: rows are matches, row i of src "
+            "with row i of dst. Match the clouds first and index both with the matches."
+        )
+    n, dtype = src.shape[0], jnp.result_type(src, dst)
+    src, dst = src.astype(dtype), dst.astype(dtype)
+    if n == 0:
+        raise ValueError("src and dst are empty: give at least 3 matches (rows).")
+    noise_bound = _numbers(noise_bound, "noise_bound", n, dtype)
+    cbar2 = _scalar(cbar2, "cbar2", dtype)
+    scale = None if scale is None else _scalar(scale, "scale", dtype)
+    mask = jnp.ones(n, bool) if mask is None else _mask(mask, n)
+    confidence = jnp.ones(n, dtype) if confidence is None else _numbers(confidence, "confidence", n, dtype)
+    if pairs is not None:
+        pairs = _pairs(pairs, n)
+    _check_values(src, dst, noise_bound, mask, confidence)
+    return Problem(src, dst, noise_bound, cbar2, mask, confidence, scale, pairs)
+
+
+def stack_problems(problems: Sequence[Problem]) -> Problem:
+    """Problems of any sizes as one batch: padded to the largest, padding masked.
+
+    Gradients: exact.
+
+    Raises:
+        ValueError: If there are none, or scale or pairs are given in some but not in all.
+    """
+    problems = list(problems)
+    if not problems:
+        raise ValueError("stack_problems received no problem.")
+    for name in ("scale", "pairs"):
+        if len({getattr(p, name) is None for p in problems}) > 1:
+            raise ValueError(
+                f"some problems have {name}=None and some do not: stack each kind by itself."
+            )
+    n = max(p.src.shape[0] for p in problems)
+    m = None if problems[0].pairs is None else max(p.pairs.shape[0] for p in problems)
+    return jax.tree.map(lambda *x: jnp.stack(x), *[pad_problem(p, n, m) for p in problems])
+
+
+def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
+    """The same problem in n rows (and m pairs): added rows are masked and change nothing.
+
+    Keeps numpy arrays numpy. Gradients: exact.
+    """
+
+    def pad(x: Any, rows: int, value: Any) -> Any:
+        if x.shape[0] > rows:
+            raise ValueError(f"cannot pad {x.shape[0]} rows to {rows}")
+        xp = jnp if isinstance(x, jax.Array) else np
+        widths = [(0, rows - x.shape[0])] + [(0, 0)] * (x.ndim - 1)
+        return xp.pad(x, widths, constant_values=value) if rows > x.shape[0] else x
+
+    return Problem(
+        src=pad(problem.src, n, 0),
+        dst=pad(problem.dst, n, 0),
+        noise_bound=pad(problem.noise_bound, n, 1),
+        cbar2=problem.cbar2,
+        mask=pad(problem.mask, n, False),
+        confidence=pad(problem.confidence, n, 0),
+        scale=problem.scale,
+        pairs=None if problem.pairs is None else pad(problem.pairs, m or problem.pairs.shape[0], 0),
+    )
+
+
+def is_traced(*values: Any) -> bool:
+    """Whether any leaf is a tracer, so that its value is not known."""
+    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
+
+
+def _as_array(value: Any, name: str) -> Any:
+    """A JAX array of a real dtype from anything with __array__ or __dlpack__."""
+    if isinstance(value, jax.Array):
+        array = value
+    else:
+        array = as_numpy(value, name)
+    if array.dtype.kind not in "fiub" and array.dtype != jnp.bfloat16:
+        raise ValueError(
+            f"{name} has dtype {array.dtype}: expected real numbers. Convert it, for instance with "
+            "numpy.asarray(x, dtype=float)."
+        )
+    return array
+
+
+def as_numpy(value: Any, name: str) -> np.ndarray:
+    """A numpy view or copy of anything with ``__array__`` or ``__dlpack__``, or nested lists."""
+    try:
+        if hasattr(value, "__dlpack__") and not hasattr(value, "__array__"):
+            return np.from_dlpack(value)
+        return np.asarray(value)
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        raise ValueError(
+            f"{name} cannot be read as an array ({type(value).__name__}: {error}). Give an array on "
+            "the host, or anything with __array__ or __dlpack__."
+        ) from error
+
+
+def _floats(value: Any, name: str) -> Any:
+    array = _as_array(value, name)
+    if array.dtype.kind == "b":
+        raise ValueError(f"{name} holds truth values: expected real numbers.")
+    array = jnp.asarray(array)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+
+
+def _points(value: Any, name: str) -> Any:
+    shape = np.shape(value) if not hasattr(value, "shape") else tuple(value.shape)
+    if len(shape) == 2 and shape[0] == 3 and shape[1] != 3:
+        raise ValueError(f"{name} has shape {shape}: points are rows, so pass {name}.T of shape (n, 3).")
+    if len(shape) != 2 or shape[1] != 3:
+        if 0 in shape:
+            raise ValueError(f"{name} is empty (shape {shape}): give at least 3 matches (rows).")
+        raise ValueError(f"{name} has shape {shape}: expected (n, 3), one point a row.")
+    return _floats(value, name)
+
+
+def _numbers(value: Any, name: str, n: int, dtype: Any) -> Any:
+    array = _floats(value, name)
+    if array.shape not in ((), (n,)):
+        raise ValueError(f"{name} has shape {array.shape}: expected one number or one a match, ({n},).")
+    return jnp.broadcast_to(array.astype(dtype), (n,))
+
+
+def _scalar(value: Any, name: str, dtype: Any) -> Any:
+    array = _floats(value, name)
+    if array.shape != ():
+        raise ValueError(f"{name} has shape {array.shape}: expected one number.")
+    if not is_traced(array) and not (np.isfinite(array) and array > 0):
+        raise ValueError(f"{name} is {array}: expected a number above 0.")
+    return array.astype(dtype)
+
+
+def _mask(value: Any, n: int) -> Any:
+    array = _as_array(value, "mask")
+    if array.shape != (n,) or array.dtype.kind != "b":
+        raise ValueError(
+            f"mask has shape {array.shape} and dtype {array.dtype}: expected ({n},) truth values, one a match."
+        )
+    return jnp.asarray(array)
+
+
+def _pairs(value: Any, n: int) -> Any:
+    if hasattr(value, "edges") and hasattr(value, "nodes"):  # a networkx.Graph
+        value = np.asarray(list(value.edges()), dtype=object).reshape(-1, 2)
+        if not all(isinstance(x, (int, np.integer)) for x in value.ravel()):
+            raise ValueError("the nodes of the pairs graph must be row numbers (integers).")
+        value = value.astype(np.int64)
+    array = _as_array(value, "pairs")
+    if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
+        raise ValueError(
+            f"pairs has shape {array.shape} and dtype {array.dtype}: expected (m, 2) integers, "
+            "the row numbers of each pair."
+        )
+    if not is_traced(array) and array.size:
+        low, high = int(np.min(array)), int(np.max(array))
+        if low < 0 or high >= n:
+            raise ValueError(f"pairs refer to rows {low} to {high}, but rows run from 0 to {n - 1}.")
+    return jnp.asarray(array).astype(jnp.int32)
+
+
+def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: Any) -> None:
+    """Checks of what is concrete; anything traced is left to the solver."""
+    if not is_traced(noise_bound, mask):
+        bounds = np.asarray(noise_bound)[np.asarray(mask)]
+        if bounds.size and not np.all(bounds > 0):
+            bad = bounds[~(bounds > 0)][0]
+            raise ValueError(
+                f"noise_bound contains {bad}: it is the largest error of a right match, a number above 0 "
+                "in the unit of the points."
+            )
+        if not np.all(np.isfinite(bounds)):
+            raise ValueError("noise_bound contains infinity: give the largest error of a right match.")
+    if not is_traced(confidence):
+        values = np.asarray(confidence)
+        if not np.all(values >= 0) or not np.all(np.isfinite(values)):
+            raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
+    if is_traced(src, dst, mask, noise_bound):
+        return
+    a, b, use = np.asarray(src), np.asarray(dst), np.asarray(mask)
+    usable = use & np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    if use.any() and not usable.any():
+        raise ValueError("no row of src and dst is finite: every match holds NaN or infinity.")
+    if usable.any():
+        largest = max(np.abs(a[usable]).max(), np.abs(b[usable]).max())
+        rounding, bound = np.finfo(a.dtype).eps * largest, np.asarray(noise_bound)[usable].min()
+        if rounding > 0.01 * bound:
+            raise ValueError(
+                f"coordinates reach {largest:.3g}, where {a.dtype} resolves {rounding:.2g}: more than 1 % "
+                f"of noise_bound {bound:.3g}. Subtract a common origin from each cloud first, or use "
+                "register(), which does that in float64."
+            )

@@ -1,0 +1,92 @@
+"""Where the time goes: the stages of ``register`` one by one, each timed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from teaser_jax.register import (
+    Registration, after_clique, between, centre, device_clique, host_problem, registration_of, to_bucket,
+)  # fmt: skip
+from teaser_jax.solve import (
+    Graph, find_edges, find_inliers, find_rotation, find_scale, find_translation,
+)  # fmt: skip
+from teaser_jax.types import Settings
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Seconds of each stage, first call (compilation included) and warm, and the answer.
+
+    Attributes:
+        cold, warm: Stage name to seconds; warm is the median of the repeats.
+        result: What ``register`` returns.
+    """
+
+    cold: dict[str, float]
+    warm: dict[str, float]
+    result: Registration
+
+    def __str__(self) -> str:
+        rows = [f"  {'stage':<24}{'first call':>12}{'warm':>12}"]
+        rows += [
+            f"  {name:<24}{1e3 * self.cold[name]:>9.2f} ms{1e3 * seconds:>9.2f} ms"
+            for name, seconds in self.warm.items()
+        ]
+        total = f"  {'total':<24}{1e3 * sum(self.cold.values()):>9.2f} ms{1e3 * sum(self.warm.values()):>9.2f} ms"
+        return "\n".join([*rows, total])
+
+
+def profile(
+    src: Any, dst: Any, *, settings: Settings = Settings(), repeats: int = 5, **known: Any  # noqa: B008
+) -> Profile:
+    """Run ``register`` stage by stage and time each, apart from and after compilation.
+
+    Arguments are those of ``register``. Stages run as programs of their own, so their sum lies
+    above the time of one ``register`` call, in which neighbours are fused.
+
+    Raises:
+        ValueError: As ``register``.
+    """
+    problem = host_problem(src, dst, **known)
+    cold: dict[str, float] = {}
+    warm: dict[str, list[float]] = {}
+
+    def timed(name: str, run: Callable[..., Any], *inputs: Any) -> Any:
+        for repeat in range(repeats + 1):
+            start = time.perf_counter()
+            output = jax.block_until_ready(run(*inputs))
+            seconds = time.perf_counter() - start
+            cold[name] = seconds if repeat == 0 else cold[name]
+            if repeat > 0:
+                warm.setdefault(name, []).append(seconds)
+        return output
+
+    centred, origins = timed("centre", centre, problem)
+    padded = to_bucket(centred)
+    with jax.enable_x64(True):
+        scale, scale_pairs = timed("scale", _find_scale, padded, settings)
+        edges = timed("consistency graph", _find_edges, padded, scale)
+        graph = Graph(scale, scale_pairs, edges)
+        found = timed("clique, device", _device_clique, padded, graph, settings)
+        clique = timed("clique, host", between, padded, graph, found, settings)
+        turned = timed("rotation", _find_rotation, padded, scale, clique.members, settings)
+        cascade, _ = timed(
+            "translation", _find_translation, padded, scale, clique.members, turned.members, settings
+        )
+        if settings.refine:
+            timed("refinement", _find_inliers, padded, cascade, settings)
+        solution = jax.device_get(after_clique(padded, graph, clique, settings))
+    medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
+    return Profile(cold, medians, registration_of(solution, problem, origins))
+
+
+_find_scale, _find_edges, _find_rotation, _find_translation, _find_inliers, _device_clique = (
+    jax.jit(f)
+    for f in (find_scale, find_edges, find_rotation, find_translation, find_inliers, device_clique)
+)

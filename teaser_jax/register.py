@@ -1,0 +1,215 @@
+"""The front door: one call outside jit, numpy in and out, float64 throughout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from teaser_jax import so3
+from teaser_jax.problem import as_numpy, is_traced, make_problem, pad_problem
+from teaser_jax.solve import Graph, conclude, prepare, usable_rows
+from teaser_jax.stages.clique import Clique, maximum_clique, search_on_host
+from teaser_jax.stages.invariants import words
+from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
+
+SMALLEST_BUCKET = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """The answer of ``register``: host values in float64, in the input's frames and order.
+
+    Attributes:
+        pose: ``T_dst_src``.
+        inliers: (n,) matches that the pose explains.
+        status: What happened; ``status.advice`` says what to try.
+        solution: The same as a pytree of numpy arrays, with the sets behind the pose.
+    """
+
+    pose: Pose
+    inliers: np.ndarray
+    status: Status
+    solution: Solution
+
+    @property
+    def ok(self) -> bool:
+        """Whether to trust the pose."""
+        return self.status == Status.OK
+
+    def __str__(self) -> str:
+        return summary(self)
+
+
+def register(
+    src: Any,
+    dst: Any,
+    *,
+    noise_bound: Any,
+    scale: Any = 1.0,
+    cbar2: Any = 1.0,
+    mask: Any = None,
+    confidence: Any = None,
+    pairs: Any = None,
+    settings: Settings = Settings(),  # noqa: B008
+) -> Registration:
+    """Register matched points, most of which may be wrong: ``dst_i ~ s R src_i + t``.
+
+    Centres both clouds in float64 and solves in float64 whatever JAX is set to, without touching
+    its configuration. Sizes are padded to a few buckets, so a stream of different sizes compiles
+    few programs.
+
+    Args:
+        src, dst: (n, 3) points, row i with row i; anything with ``__array__`` or ``__dlpack__``.
+        noise_bound: Largest error of a right match, one number or (n,) [unit of the points].
+        scale: Known scale [-], or None: estimate it.
+        cbar2: Truncation of the cost, c-bar squared [-].
+        mask: (n,) rows to use.
+        confidence: (n,) weights of the matches in the final fit; 0 equals masked.
+        pairs: (m, 2) index pairs to compare, or a ``networkx.Graph``; None: all.
+        settings: How to solve.
+
+    Returns:
+        A ``Registration``; act upon it only where ``ok``.
+
+    Raises:
+        ValueError: Bad input, with what was received and what to do; also when called under jit,
+            where ``solve`` is the function to use.
+    """
+    if is_traced(src, dst, noise_bound, scale, cbar2, mask, confidence, pairs):
+        raise ValueError(
+            "register was called on traced values, inside jit, vmap or grad. It runs on the host: use "
+            "teaser_jax.solve(teaser_jax.make_problem(...)) there."
+        )
+    problem = host_problem(
+        src, dst, noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
+        confidence=confidence, pairs=pairs,
+    )  # fmt: skip
+    centred, origins = centre(problem)
+    padded = to_bucket(centred)
+    with jax.enable_x64(True):
+        graph, found = before_clique(padded, settings)
+        clique = between(padded, graph, found, settings)
+        solution = jax.device_get(after_clique(padded, graph, clique, settings))
+    return registration_of(solution, problem, origins)
+
+
+def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
+    """``make_problem`` in float64 numpy, from anything that can be read on the host."""
+    src, dst = as_numpy(src, "src"), as_numpy(dst, "dst")
+    with jax.enable_x64(True):
+        widened = [x.astype(np.float64) if x.dtype.kind in "fiu" else x for x in (src, dst)]
+        return jax.tree.map(np.asarray, make_problem(*widened, **known))
+
+
+def centre(problem: Problem) -> tuple[Problem, tuple[np.ndarray, np.ndarray]]:
+    """The problem about the middle of its usable points, and the two origins taken away.
+
+    The median is meant: one absurd coordinate must not move the origin far from the rest.
+    """
+    finite = np.isfinite(problem.src).all(axis=1) & np.isfinite(problem.dst).all(axis=1)
+    usable = problem.mask & finite
+    if not usable.any():
+        return problem, (np.zeros(3), np.zeros(3))
+    origins = np.median(problem.src[usable], axis=0), np.median(problem.dst[usable], axis=0)
+    return replace(problem, src=problem.src - origins[0], dst=problem.dst - origins[1]), origins
+
+
+def bucket(n: int) -> int:
+    """The padded size: powers of two up to 1024, then steps of 512. Few programs, little waste."""
+    if n <= 1024:
+        return max(SMALLEST_BUCKET, 1 << (n - 1).bit_length())
+    return -(-n // 512) * 512
+
+
+def to_bucket(problem: Problem) -> Problem:
+    """The problem padded to its buckets of matches and pairs."""
+    m = None if problem.pairs is None else bucket(max(1, problem.pairs.shape[0]))
+    return pad_problem(problem, bucket(problem.src.shape[0]), m)
+
+
+@jax.jit
+def before_clique(problem: Problem, settings: Settings) -> tuple[Graph, Clique]:
+    """Device program one: scale, graph, and the clique as far as the device takes it."""
+    graph = prepare(problem, settings)
+    return graph, device_clique(problem, graph, settings)
+
+
+def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:
+    """The clique as far as the device takes it: the greedy one with its bound."""
+    method = "none" if settings.clique == "none" else "greedy"
+    return maximum_clique(graph.edge_bits, usable_rows(problem)[0].mask, method=method)
+
+
+@jax.jit
+def after_clique(problem: Problem, graph: Graph, clique: Clique, settings: Settings) -> Solution:
+    """Device program two: the sets, the pose, the verdict."""
+    return conclude(problem, graph, clique, settings)
+
+
+def between(problem: Problem, graph: Graph, found: Clique, settings: Settings) -> Clique:
+    """The host's turn, between the two programs: nothing where the device has a proof."""
+    proved = int(np.sum(found.members)) >= int(found.upper_bound)
+    if settings.clique in ("none", "greedy") or (settings.clique == "exact" and proved):
+        return found
+    mask = np.asarray(usable_rows(problem)[0].mask)
+    return search_on_host(
+        np.asarray(graph.edge_bits), mask, found,
+        method=settings.clique, nodes=settings.clique_nodes, seconds=settings.clique_seconds,
+    )  # fmt: skip
+
+
+def registration_of(
+    solution: Solution, problem: Problem, origins: tuple[np.ndarray, np.ndarray]
+) -> Registration:
+    """The padded and centred solution, in the frames and rows of the user's problem."""
+    n = problem.src.shape[0]
+    m = None if problem.pairs is None else problem.pairs.shape[0]
+    centred, (src_origin, dst_origin) = solution.pose, origins
+    translation = dst_origin + centred.translation - centred.scale * centred.rotation @ src_origin
+    pose = Pose(centred.rotation, translation, np.asarray(centred.scale))
+    selection = _first_rows(solution.selection, n, m)
+    solution = replace(solution, pose=pose, selection=selection, inliers=selection.inliers)
+    return Registration(pose, selection.inliers, Status(int(solution.status)), solution)
+
+
+def _first_rows(selection: Selection, n: int, m: int | None) -> Selection:
+    def cut(pair_set: Any) -> Any:
+        if pair_set is None:
+            return None
+        if pair_set.dtype == np.uint32:  # padding came last, so the words of the first n stay as they are
+            return pair_set[:n, : words(n)]
+        return pair_set[: n if m is None else m]
+
+    return replace(
+        selection,
+        scale_pairs=cut(selection.scale_pairs),
+        clique=selection.clique[:n],
+        rotation=cut(selection.rotation),
+        translation=selection.translation[:n],
+        inliers=selection.inliers[:n],
+    )
+
+
+def summary(result: Registration) -> str:
+    """A few lines that a person can read."""
+    s = result.solution
+    n, inliers = len(result.inliers), int(result.inliers.sum())
+    angle = np.degrees(so3.rotation_angle(result.pose.rotation))
+    x, y, z = result.pose.translation
+    proof = "proved maximum" if s.clique_is_maximum else f"not proved, at most {int(s.clique_upper_bound)}"
+    rows = [
+        f"{'ok' if result.ok else 'NOT OK'}: {result.status.name}",
+        f"  inliers      {inliers} of {n} matches"
+        + (f" ({int(s.excluded)} rows were not finite and left out)" if s.excluded else ""),
+        f"  clique       {int(s.clique_size)} matches agree pairwise, {proof}",
+        f"  scale        {float(result.pose.scale):.6g}",
+        f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) "
+        + "(" + ", ".join(f"{q:.6f}" for q in result.pose.quat) + ")",
+        f"  translation  ({x:.6g}, {y:.6g}, {z:.6g})",
+        f"  cost (6)     {float(s.cost):.6g}",
+        f"  {result.status.advice}",
+    ]
+    return "\n".join(rows)

@@ -1,0 +1,270 @@
+"""The whole method on one page: choose discretely, estimate smoothly.
+
+    prepare    scale, consistency graph, greedy clique            on the device
+    search     exact clique, where the device has no proof        on the host
+    select     rotation, translation, refinement: which measurements to trust
+    refit      the pose from those sets, in closed form           gradients flow
+
+``solve`` strings them together inside jit. ``register`` runs the same pieces around the host.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from teaser_jax import so3
+from teaser_jax.stages.clique import Clique, maximum_clique
+from teaser_jax.stages.consistency import consistency_graph
+from teaser_jax.stages.invariants import tim_bounds, tims
+from teaser_jax.stages.refinement import fit_similarity, refine, squared_residuals, truncated_cost
+from teaser_jax.stages.rotation import (
+    Rotation, Tims, complete_tims, correlation, correlation_of_pairs, estimate_rotation, listed_tims, ring_tims,
+)  # fmt: skip
+from teaser_jax.stages.scale import ScalePairs, estimate_scale, scale_of_pairs, usable_pairs
+from teaser_jax.stages.translation import estimate_translation, translation_of_points
+from teaser_jax.stages.trust import judge
+from teaser_jax.types import Pose, Problem, Selection, Settings, Solution
+
+
+class Graph(NamedTuple):
+    """What is known before the clique: the scale, who voted for it, and which matches agree."""
+
+    scale: Float[Array, ""]
+    scale_pairs: ScalePairs | None
+    edge_bits: UInt32[Array, "n w"]
+
+
+def solve(problem: Problem, settings: Settings = Settings()) -> Solution:  # noqa: B008
+    """Robust registration of matched points: TEASER++, then a joint refinement.
+
+    A pure function: works under jit, vmap, grad and lax.scan, on one device (the exact clique
+    calls the host once a batch). Follows the dtype of the problem; scale and translation vote in
+    float64 inside. Never raises on values: see ``Solution.status``.
+
+    Args:
+        problem: From ``make_problem``; lengths in the user's unit.
+        settings: Choices are static, numbers traced.
+
+    Returns:
+        The pose from the source to the target frame and what it rests on. Finite always.
+
+    Gradients: exact through ``refit`` as long as the chosen sets do not change, that is almost
+    everywhere; the sets themselves carry none.
+
+    References: Yang, Shi, Carlone, T-RO 2020, Algorithm 1 with MCIS (section VI-D) and GNC.
+    """
+    frozen = lax.stop_gradient(problem)
+    graph = prepare(frozen, settings)
+    usable, _ = usable_rows(frozen)
+    clique = maximum_clique(
+        graph.edge_bits,
+        usable.mask,
+        method=settings.clique,
+        nodes=settings.clique_nodes,
+        seconds=settings.clique_seconds,
+    )
+    return conclude(problem, graph, clique, settings)
+
+
+def prepare(problem: Problem, settings: Settings = Settings()) -> Graph:  # noqa: B008
+    """The scale and the consistency graph."""
+    scale, scale_pairs = find_scale(problem, settings)
+    return Graph(scale, scale_pairs, find_edges(problem, scale))
+
+
+def find_scale(
+    problem: Problem, settings: Settings = Settings()  # noqa: B008
+) -> tuple[Float[Array, ""], ScalePairs | None]:
+    """The known scale, or the vote (11) and the pairs that agree with it."""
+    p, _ = usable_rows(problem)
+    if p.scale is not None:
+        return p.scale, None
+    return estimate_scale(
+        p.src, p.dst, p.noise_bound, p.mask,
+        cbar2=p.cbar2, pairs=p.pairs, criterion=settings.vote, scale_range=settings.scale_range,
+    )  # fmt: skip
+
+
+def find_edges(problem: Problem, scale: Float[Array, ""]) -> UInt32[Array, "n w"]:
+    """The consistency graph at a scale."""
+    p, _ = usable_rows(problem)
+    return consistency_graph(
+        p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs
+    )
+
+
+def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()) -> Solution:  # noqa: B008
+    """Everything behind the clique: the sets, the pose, and whether to trust it."""
+    graph, clique = lax.stop_gradient((graph, clique))
+    selection, converged = select(lax.stop_gradient(problem), graph, clique, settings)
+    pose = _refit(problem, selection, refined=settings.refine)
+    p, excluded = usable_rows(problem)
+    frozen_pose = lax.stop_gradient(pose)
+    clique_size = jnp.sum(clique.members, dtype=jnp.int32)
+    status = judge(
+        lax.stop_gradient(p), frozen_pose, selection.inliers, clique_size,
+        converged=converged, pruned=settings.clique != "none",
+    )  # fmt: skip
+    return Solution(
+        pose=pose,
+        selection=selection,
+        inliers=selection.inliers,
+        status=status,
+        clique_size=clique_size,
+        clique_upper_bound=clique.upper_bound,
+        clique_is_maximum=(clique_size == clique.upper_bound) & (settings.clique != "none"),
+        excluded=excluded,
+        cost=truncated_cost(squared_residuals(pose, p.src, p.dst, p.noise_bound), p.mask, p.cbar2),
+    )
+
+
+def select(
+    problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()  # noqa: B008
+) -> tuple[Selection, Bool[Array, ""]]:
+    """Which measurements to trust, given the clique, and whether every iteration settled.
+
+    Gradients: none; ``solve`` stops the inputs.
+    """
+    members = clique.members & usable_rows(problem)[0].mask
+    turned = find_rotation(problem, graph.scale, members, settings)
+    cascade, axes = find_translation(problem, graph.scale, members, turned.members, settings)
+    inliers, settled = members & jnp.all(axes, axis=1), jnp.ones((), bool)
+    if settings.refine:
+        inliers, settled = find_inliers(problem, cascade, settings)
+    selection = Selection(
+        scale_pairs=graph.scale_pairs,
+        clique=members,
+        rotation=turned.members,
+        translation=axes,
+        inliers=inliers,
+        refined=jnp.asarray(settings.refine),
+    )
+    return selection, turned.converged & settled
+
+
+def find_rotation(
+    problem: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], settings: Settings
+) -> Rotation:
+    """GNC on the TIMs among the clique's members (12)."""
+    p, _ = usable_rows(problem)
+    return estimate_rotation(
+        _rotation_tims(p, members, _positive(scale), settings.tim_graph),
+        cbar2=p.cbar2,
+        gnc_factor=settings.gnc_factor,
+        tolerance=settings.gnc_tolerance,
+        iterations=settings.gnc_iterations,
+        dtype=p.src.dtype,
+    )
+
+
+def find_translation(
+    problem: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], chosen: Array, settings: Settings
+) -> tuple[Pose, Bool[Array, "n 3"]]:
+    """The vote of each axis (13): the cascade's pose, and the members behind its translation."""
+    p, _ = usable_rows(problem)
+    scale, rotation = _positive(scale), _rotation_of(p, members, chosen)
+    offsets = p.dst - scale * so3.rotate(rotation, p.src)
+    translation, axes = estimate_translation(
+        offsets, p.noise_bound, members, cbar2=p.cbar2, criterion=settings.vote
+    )
+    return Pose(rotation, translation, scale), axes
+
+
+def find_inliers(
+    problem: Problem, cascade: Pose, settings: Settings
+) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
+    """The consensus set where the joint cost (6) stops falling, and whether it did stop."""
+    p, _ = usable_rows(problem)
+    return refine(
+        cascade, p.src, p.dst, p.noise_bound, p.mask,
+        scale=p.scale, cbar2=p.cbar2, iterations=settings.refine_iterations,
+    )  # fmt: skip
+
+
+def refit(problem: Problem, selection: Selection) -> Pose:
+    """The pose from the chosen sets, in closed form: the smooth half of the method.
+
+    Refined selections give the weighted similarity fit over ``inliers``; others give (11) - (13)
+    on the frozen sets with binary weights. Weights are confidence_i / beta_i^2.
+
+    Gradients: exact in points, bounds, known scale and confidences; memory O(n) (complete TIM
+    graphs and voted scales: one slice of the pairs at a time).
+    """
+    return lax.cond(
+        selection.refined,
+        lambda: _refit(problem, selection, refined=True),
+        lambda: _refit(problem, selection, refined=False),
+    )
+
+
+def _refit(problem: Problem, selection: Selection, *, refined: bool) -> Pose:
+    p, _ = usable_rows(problem)
+    if refined:
+        weights = jnp.where(selection.inliers, p.confidence / p.noise_bound**2, 0)
+        return fit_similarity(p.src, p.dst, weights, p.scale).pose
+    scale = p.scale
+    if scale is None:
+        voted = scale_of_pairs(
+            p.src, p.dst, p.noise_bound, p.confidence, selection.scale_pairs, pairs=p.pairs
+        )
+        scale = _positive(voted)
+    rotation = _rotation_of(p, selection.clique, selection.rotation)
+    offsets = p.dst - scale * so3.rotate(rotation, p.src)
+    translation = translation_of_points(offsets, p.noise_bound, p.confidence, selection.translation)
+    return Pose(rotation, translation, scale)
+
+
+def _positive(scale: Float[Array, ""]) -> Float[Array, ""]:
+    """The scale, or 1 where nothing could vote: what follows must stay finite."""
+    return jnp.where(scale > 0, scale, 1)
+
+
+def _rotation_tims(p: Problem, members: Array, scale: Array, tim_graph: str) -> Tims:
+    """The TIMs of the rotation stage among the clique's members, source scaled."""
+    if p.pairs is None and tim_graph == "complete":
+        return complete_tims(scale * p.src, p.dst, p.noise_bound, members)
+    pairs = ring_tims(members) if p.pairs is None else p.pairs
+    a, b, bounds = tims(scale * p.src, pairs), tims(p.dst, pairs), tim_bounds(p.noise_bound, pairs)
+    return listed_tims(a, b, bounds, usable_pairs(pairs, members))
+
+
+def _rotation_of(p: Problem, members: Array, chosen: Array) -> Float[Array, "3 3"]:
+    """The closed-form rotation on the chosen TIMs (12); its scale does not matter."""
+    if chosen.dtype == jnp.uint32:
+        h = correlation_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, chosen)
+    else:
+        pairs = ring_tims(members) if p.pairs is None else p.pairs
+        weight = p.confidence[pairs[:, 0]] * p.confidence[pairs[:, 1]]
+        weight = jnp.where(chosen, weight / tim_bounds(p.noise_bound, pairs) ** 2, 0)
+        h = correlation(weight, tims(p.src, pairs), tims(p.dst, pairs))
+    return so3.nearest_rotation(h)
+
+
+def usable_rows(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
+    """The problem with unusable rows masked and made harmless, and the count of non-finite rows.
+
+    Values are replaced *before* anything is computed from them, so that neither results nor
+    gradients of the other rows see a NaN.
+    """
+    finite = (
+        jnp.all(jnp.isfinite(problem.src), axis=1)
+        & jnp.all(jnp.isfinite(problem.dst), axis=1)
+        & jnp.isfinite(problem.noise_bound)
+        & jnp.isfinite(problem.confidence)
+    )
+    usable = problem.mask & finite & (problem.noise_bound > 0) & (problem.confidence > 0)
+    cleaned = replace(
+        problem,
+        src=jnp.where(usable[:, None], problem.src, 0),
+        dst=jnp.where(usable[:, None], problem.dst, 0),
+        noise_bound=jnp.where(usable, problem.noise_bound, 1),
+        confidence=jnp.where(usable, problem.confidence, 0),
+        mask=usable,
+    )
+    return cleaned, jnp.sum(problem.mask & ~finite, dtype=jnp.int32)

@@ -1,0 +1,35 @@
+"""Packed bit rows: n verdicts in n/32 words. Bit t of word j stands for column 32 j + t."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Int, UInt32
+
+from teaser_jax.stages.invariants import LANES, words
+
+
+def pack(mask: Bool[Array, "*k n"]) -> UInt32[Array, "*k w"]:
+    """A mask as words along the last axis; bits beyond n are zero."""
+    *batch, n = mask.shape
+    padded = jnp.pad(mask, [(0, 0)] * len(batch) + [(0, words(n) * LANES - n)])
+    lanes = padded.reshape(*batch, words(n), LANES).astype(jnp.uint32)
+    return jnp.sum(lanes << jnp.arange(LANES, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
+
+
+def unpack(packed: UInt32[Array, "*k w"], n: int) -> Bool[Array, "*k n"]:
+    """Words as a mask of n bits along the last axis."""
+    bits = (packed[..., None] >> jnp.arange(LANES, dtype=jnp.uint32)) & 1
+    return bits.reshape(*packed.shape[:-1], -1)[..., :n].astype(bool)
+
+
+def count(packed: UInt32[Array, "*k w"]) -> Int[Array, "*k"]:
+    """Number of set bits along the last axis."""
+    return jnp.sum(lax.population_count(packed), axis=-1, dtype=jnp.int32)
+
+
+def unpack_host(packed: np.ndarray, n: int) -> np.ndarray:
+    """Words (k, w) as a boolean (k, n) array, in numpy, whatever the machine's byte order."""
+    little = np.ascontiguousarray(packed).astype("<u4", copy=False)
+    return np.unpackbits(little.view(np.uint8), axis=-1, bitorder="little", count=n).astype(bool)

@@ -1,0 +1,111 @@
+"""The joint fit: all matches, all unknowns, cost (6) itself.
+
+The cascade makes the problem solvable but estimates each unknown from its own invariants, which
+loses accuracy. From its answer, alternating the inlier set over *all* matches and the closed-form
+fit on that set descends (6) and ends at a least squares solution on its own consensus set.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from teaser_jax import so3
+from teaser_jax.stages.rotation import correlation
+from teaser_jax.types import Pose
+
+
+class Fit(NamedTuple):
+    """A weighted similarity fit and the correlation matrix behind its rotation."""
+
+    pose: Pose
+    correlation: Float[Array, "3 3"]  # sum w (b - mean b)(a - mean a)^T
+
+
+def fit_similarity(
+    src: Float[Array, "n 3"],
+    dst: Float[Array, "n 3"],
+    weights: Float[Array, " n"],
+    scale: Float[Array, ""] | None = None,
+) -> Fit:
+    """The minimiser of sum w |b - s R a - t|^2; ``scale=None`` estimates s = tr(R^T H) / sum w |a|^2.
+
+    Weights of zero everywhere, or a source of no extent, give a finite answer (scale 1).
+
+    Gradients: exact; the rotation's is zero where it is ambiguous.
+
+    References: Horn, JOSA A 1987; Umeyama, PAMI 1991.
+    """
+    total = jnp.sum(weights)
+    total = jnp.where(total > 0, total, 1)
+    high = lax.Precision.HIGHEST
+    src_mean = jnp.einsum("n,ni->i", weights, src, precision=high) / total
+    dst_mean = jnp.einsum("n,ni->i", weights, dst, precision=high) / total
+    a, b = src - src_mean, dst - dst_mean
+    h = correlation(weights, a, b)
+    rotation = so3.nearest_rotation(h)
+    if scale is None:
+        below = jnp.sum(weights[:, None] * a * a)
+        some = below > 0
+        scale = jnp.where(some, jnp.sum(rotation * h) / jnp.where(some, below, 1), 1)
+    translation = dst_mean - scale * so3.rotate(rotation, src_mean[None])[0]
+    return Fit(Pose(rotation, translation, scale), h)
+
+
+def squared_residuals(
+    pose: Pose, src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """|b - s R a - t|^2 / beta^2 of each match [-]. Gradients: exact."""
+    return jnp.sum((dst - pose.apply(src)) ** 2, axis=1) / noise_bound**2
+
+
+def truncated_cost(
+    r2: Float[Array, " n"], mask: Bool[Array, " n"], cbar2: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The cost (6) over the matches of the mask [-]."""
+    return jnp.sum(jnp.where(mask, jnp.minimum(r2, cbar2), 0))
+
+
+def refine(
+    pose: Pose,
+    src: Float[Array, "n 3"],
+    dst: Float[Array, "n 3"],
+    noise_bound: Float[Array, " n"],
+    mask: Bool[Array, " n"],
+    *,
+    scale: Float[Array, ""] | None,
+    cbar2: Float[Array, ""],
+    iterations: int = 50,
+) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
+    """The inlier set at the end of the descent from ``pose``, and whether it settled.
+
+    Each step can only lower the cost, so the descent ends. It stops early when a set has fewer
+    than three members, which no fit can use.
+
+    Gradients: none, the set is a choice; inputs must be stopped by the caller.
+
+    References: eq. (6).
+    """
+    weights = jnp.where(mask, 1 / noise_bound**2, 0)
+
+    class Descent(NamedTuple):
+        inliers: Array
+        settled: Array
+        rounds: Array
+
+    def agree(pose: Pose) -> Array:
+        return mask & (squared_residuals(pose, src, dst, noise_bound) <= cbar2)
+
+    def step(state: Descent) -> Descent:
+        fit = fit_similarity(src, dst, jnp.where(state.inliers, weights, 0), scale)
+        inliers = agree(fit.pose)
+        usable = jnp.sum(state.inliers) >= 3
+        inliers = jnp.where(usable, inliers, state.inliers)
+        return Descent(inliers, jnp.all(inliers == state.inliers), state.rounds + 1)
+
+    start = Descent(agree(pose), jnp.zeros((), bool), jnp.zeros((), jnp.int32))
+    final = lax.while_loop(lambda s: ~s.settled & (s.rounds < iterations), step, start)
+    return final.inliers, final.settled

@@ -1,0 +1,213 @@
+"""The rotation, by graduated non-convexity on truncated least squares (section VIII, TEASER++).
+
+The cost (12) is made convex enough to start anywhere and is then stiffened round by round until
+every TIM counts fully or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from teaser_jax import so3
+from teaser_jax.stages.invariants import PairSlice, fold_pairs, words
+
+Weigh = Callable[[Array], Array]  # squared residuals in units of their bounds -> weights in [0, 1]
+
+
+class Measured(NamedTuple):
+    """What one pass over the TIMs finds at a rotation, under a weight function."""
+
+    correlation: Float[Array, "3 3"]  # sum of w / delta^2 b a^T
+    cost: Float[Array, ""]  # sum of w r^2
+    largest: Float[Array, ""]  # largest r^2
+    soft: Bool[Array, ""]  # a weight lies strictly between 0 and 1
+
+
+class Tims(NamedTuple):
+    """A set of TIMs: how to pass over it, and how to write down which of them count."""
+
+    measure: Callable[[Float[Array, "3 3"], Weigh], Measured]
+    members: Callable[[Float[Array, "3 3"], Weigh], Array]
+
+
+class Rotation(NamedTuple):
+    """The rotation, the TIMs it rests on (mask or packed bit rows), and whether GNC settled."""
+
+    rotation: Float[Array, "3 3"]
+    members: Bool[Array, " k"] | UInt32[Array, "n w"]
+    converged: Bool[Array, ""]
+
+
+def listed_tims(
+    src_tims: Float[Array, "k 3"],
+    dst_tims: Float[Array, "k 3"],
+    bounds: Float[Array, " k"],
+    mask: Bool[Array, " k"],
+) -> Tims:
+    """TIMs given one by one. Source TIMs carry the scale already."""
+    inverse2 = jnp.where(mask, 1 / jnp.where(mask, bounds, 1) ** 2, 0)
+
+    def residuals(rotation: Array) -> Array:
+        return jnp.sum((dst_tims - so3.rotate(rotation, src_tims)) ** 2, axis=1) * inverse2
+
+    def measure(rotation: Array, weigh: Weigh) -> Measured:
+        r2 = residuals(rotation)
+        w = jnp.where(mask, weigh(r2), 0)
+        return Measured(
+            correlation(w * inverse2, src_tims, dst_tims),
+            jnp.sum(w * r2),
+            jnp.max(r2, initial=0),
+            jnp.any((w > 0) & (w < 1)),
+        )
+
+    def members(rotation: Array, weigh: Weigh) -> Array:
+        return mask & (weigh(residuals(rotation)) > 0.5)
+
+    return Tims(measure, members)
+
+
+def complete_tims(
+    src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"], mask: Bool[Array, " n"]
+) -> Tims:
+    """All TIMs among the points of the mask, in O(n^2) work but never O(n^2) numbers."""
+    n, dtype = src.shape[0], src.dtype
+
+    def weighed(rotation: Array, weigh: Weigh, visited: PairSlice) -> tuple[Array, Array]:
+        difference = [
+            visited.dst_tims[i] - sum(rotation[i, j] * visited.src_tims[j] for j in range(3)) for i in range(3)
+        ]
+        r2 = sum(d * d for d in difference) / visited.bounds**2
+        return jnp.where(visited.valid, r2, 0), jnp.where(visited.valid, weigh(r2), 0)
+
+    def measure(rotation: Array, weigh: Weigh) -> Measured:
+        def add(so_far: Measured, _: Array, visited: PairSlice) -> Measured:
+            r2, w = weighed(rotation, weigh, visited)
+            return Measured(
+                so_far.correlation + _pair_correlation(w / visited.bounds**2, visited),
+                so_far.cost + jnp.sum(w * r2),
+                jnp.maximum(so_far.largest, jnp.max(r2, initial=0)),
+                so_far.soft | jnp.any((w > 0) & (w < 1)),
+            )
+
+        zero = jnp.zeros((), dtype)
+        start = Measured(jnp.zeros((3, 3), dtype), zero, zero, jnp.zeros((), bool))
+        return fold_pairs(add, start, src, dst, noise_bound, mask)
+
+    def members(rotation: Array, weigh: Weigh) -> Array:
+        def mark(rows: Array, lane: Array, visited: PairSlice) -> Array:
+            kept = weighed(rotation, weigh, visited)[1] > 0.5
+            return rows | (kept.astype(jnp.uint32) << lane.astype(jnp.uint32))
+
+        return fold_pairs(mark, jnp.zeros((n, words(n)), jnp.uint32), src, dst, noise_bound, mask)
+
+    return Tims(measure, members)
+
+
+def estimate_rotation(
+    tims: Tims,
+    *,
+    cbar2: Float[Array, ""],
+    gnc_factor: Float[Array, ""] | float = 1.4,
+    tolerance: Float[Array, ""] | float = 1e-6,
+    iterations: int = 100,
+    dtype: jnp.dtype = jnp.float32,
+) -> Rotation:
+    """GNC-TLS: a rotation and the TIMs that agree with it.
+
+    Residuals are in units of their bounds. With control mu a TIM weighs 1 below
+    mu/(mu+1) c^2, 0 above (mu+1)/mu c^2, and c sqrt(mu (mu+1)) / r - mu between. The first fit
+    uses all TIMs; if all agree with it, it is final.
+
+    Gradients: none, the members are a choice; inputs must be stopped by the caller.
+
+    References: Yang, Antonante, Tzoumas, Carlone, RA-L 2020 (GNC-TLS); eq. (12).
+    """
+    cbar2 = jnp.asarray(cbar2, dtype)
+
+    def weigh(gnc_mu: Array) -> Weigh:
+        # Clipping reproduces both thresholds of the piecewise formula.
+        height = cbar2 * gnc_mu * (gnc_mu + 1)
+        floor = jnp.finfo(dtype).tiny
+        return lambda r2: jnp.clip(jnp.sqrt(height / jnp.maximum(r2, floor)) - gnc_mu, 0, 1)
+
+    class Round(NamedTuple):
+        rotation: Array
+        gnc_mu: Array
+        cost: Array
+        settled: Array
+        rounds: Array
+
+    everything = jnp.ones_like
+    first = so3.nearest_rotation(tims.measure(jnp.eye(3, dtype=dtype), everything).correlation)
+    start = tims.measure(first, everything)
+    excess = 2 * start.largest - cbar2
+    gnc_mu = jnp.where(excess > 0, cbar2 / jnp.where(excess > 0, excess, 1), 1)
+
+    def one_round(state: Round) -> Round:
+        found = tims.measure(state.rotation, weigh(state.gnc_mu))
+        still = jnp.abs(found.cost - state.cost) <= tolerance * jnp.maximum(found.cost, cbar2)
+        return Round(
+            so3.nearest_rotation(found.correlation),
+            state.gnc_mu * gnc_factor,
+            found.cost,
+            still | ~found.soft,
+            state.rounds + 1,
+        )
+
+    initial = Round(first, gnc_mu, jnp.asarray(jnp.inf, dtype), excess <= 0, jnp.zeros((), jnp.int32))
+    final = lax.while_loop(lambda s: ~s.settled & (s.rounds < iterations), one_round, initial)
+    kept = tims.members(final.rotation, lambda r2: (r2 <= cbar2).astype(dtype))
+    return Rotation(final.rotation, kept, final.settled)
+
+
+def ring_tims(clique: Bool[Array, " n"]) -> Int[Array, "n 2"]:
+    """Pairs (i, next member after i) of the clique in the user's order, the last with the first.
+
+    Rows of points outside the clique hold (i, i).
+    """
+    n = clique.shape[0]
+    index = jnp.arange(n, dtype=jnp.int32)
+    # The next member after i: the smallest member index beyond i, else the first member.
+    ahead = lax.cummin(jnp.where(clique, index, n), reverse=True)
+    first = ahead[0] if n else jnp.zeros((), jnp.int32)
+    following = jnp.concatenate([ahead[1:], jnp.full((1,), n, jnp.int32)])[:n]
+    following = jnp.where(following < n, following, first)
+    return jnp.stack([index, jnp.where(clique, following, index)], axis=1)
+
+
+def correlation(
+    weights: Float[Array, " k"], src_tims: Float[Array, "k 3"], dst_tims: Float[Array, "k 3"]
+) -> Float[Array, "3 3"]:
+    """H = sum_k w_k b_k a_k^T. Gradients: exact."""
+    return jnp.einsum("k,ki,kj->ij", weights, dst_tims, src_tims, precision=lax.Precision.HIGHEST)
+
+
+def correlation_of_pairs(
+    src: Float[Array, "n 3"],
+    dst: Float[Array, "n 3"],
+    noise_bound: Float[Array, " n"],
+    confidence: Float[Array, " n"],
+    chosen: UInt32[Array, "n w"],
+) -> Float[Array, "3 3"]:
+    """The correlation over packed bit rows of pairs. Gradients: exact."""
+
+    def add(total: Array, lane: Array, visited: PairSlice) -> Array:
+        hit = ((chosen >> lane.astype(jnp.uint32)) & 1).astype(bool) & visited.valid
+        w = words(src.shape[0])
+        column = jnp.pad(confidence, (0, 32 * w - src.shape[0])).reshape(w, 32)[:, lane]
+        weight = jnp.where(hit, confidence[:, None] * column[None] / visited.bounds**2, 0)
+        return total + _pair_correlation(weight, visited)
+
+    everything = jnp.ones(src.shape[0], bool)
+    return fold_pairs(add, jnp.zeros((3, 3), src.dtype), src, dst, noise_bound, everything)
+
+
+def _pair_correlation(weight: Array, visited: PairSlice) -> Array:
+    return jnp.stack(
+        [jnp.stack([jnp.sum(weight * b * a) for a in visited.src_tims]) for b in visited.dst_tims]
+    )

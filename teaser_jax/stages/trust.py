@@ -1,0 +1,3 @@
+import jax.numpy as jnp
+def judge(p, pose, inliers, clique_size, *, converged, pruned):
+    return jnp.zeros((), jnp.int32)

@@ -1,0 +1,265 @@
+"""The records that travel through the method. Every one is an immutable JAX pytree."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from teaser_jax import so3
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+class Status(enum.IntEnum):
+    """What became of a solve. ``OK`` is the only one to act upon. Held as int32 inside JAX."""
+
+    OK = 0
+    TOO_FEW_POINTS = 1
+    NO_CONSENSUS = 2
+    DEGENERATE = 3
+    NOT_CONVERGED = 5  # 4 is kept for answers that have a rival
+
+    @property
+    def advice(self) -> str:
+        """One sentence: what happened and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OK: "The pose is determined by its inliers, and they agree better than chance allows.",
+    Status.TOO_FEW_POINTS: (
+        "Fewer than 3 usable matches: check for non-finite rows, the mask and the confidences, "
+        "or give more matches."
+    ),
+    Status.NO_CONSENSUS: (
+        "No set of matches agrees better than wrong matches would by chance: check that the two "
+        "clouds overlap and that noise_bound is in their unit, or find better matches."
+    ),
+    Status.DEGENERATE: (
+        "The inliers lie on a point or a line compared with noise_bound, so they do not determine "
+        "the rotation or the scale: add matches away from that line."
+    ),
+    Status.NOT_CONVERGED: (
+        "An iteration cap was reached before the inliers settled: raise Settings.gnc_iterations "
+        "or Settings.refine_iterations."
+    ),
+}
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["src", "dst", "noise_bound", "cbar2", "mask", "confidence", "scale", "pairs"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class Problem:
+    """Matched points and what is known about them. Built by ``make_problem``.
+
+    Attributes:
+        src, dst: Matched points, row i with row i [length unit of the user].
+        noise_bound: beta_i, the largest error of a right match [same unit].
+        cbar2: Truncation c-bar squared of the cost (6) [-].
+        mask: Rows to use; padding is masked.
+        confidence: Weight of each match in the final fit, w_i = confidence_i / beta_i^2 [-].
+        scale: Known scale [-], or None: estimate it. None is structure, so static under jit.
+        pairs: Index pairs whose TIMs are used, or None for all. A pair (i, i) is padding.
+    """
+
+    src: Float[Array, "n 3"]
+    dst: Float[Array, "n 3"]
+    noise_bound: Float[Array, " n"]
+    cbar2: Float[Array, ""]
+    mask: Bool[Array, " n"]
+    confidence: Float[Array, " n"]
+    scale: Float[Array, ""] | None = None
+    pairs: Int[Array, "m 2"] | None = None
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["gnc_factor", "gnc_tolerance", "scale_range"],
+    meta_fields=[
+        "clique", "rotation", "tim_graph", "vote", "refine",
+        "gnc_iterations", "refine_iterations", "clique_nodes", "clique_seconds",
+    ],
+)  # fmt: skip
+@dataclass(frozen=True)
+class Settings:
+    """How to solve. Choices and caps are static under jit, numbers are traced.
+
+    Attributes:
+        clique: ``"exact"`` maximum clique (host search where the device has no proof),
+            ``"greedy"`` on the device, ``"networkx"`` slow oracle, ``"none"`` no pruning.
+        rotation: ``"gnc"``, graduated non-convexity.
+        tim_graph: TIMs of the rotation stage: ``"chain"`` of consecutive clique members, closed
+            to a ring, or the ``"complete"`` graph of the clique. Given pairs take their place.
+        vote: Scalar estimates by ``"tls"`` (11) or by maximum ``"consensus"``.
+        refine: End by descending the joint cost (6); False gives the paper's plain cascade.
+        gnc_iterations, refine_iterations: Caps on rounds.
+        clique_nodes, clique_seconds: Budget of the exact search; when it is spent the best
+            clique so far and a proved upper bound are returned.
+        gnc_factor: Growth of the GNC control parameter each round [-].
+        gnc_tolerance: Relative change of the GNC cost that counts as none [-].
+        scale_range: Search interval of an unknown scale [-].
+    """
+
+    clique: Literal["exact", "greedy", "networkx", "none"] = "exact"
+    rotation: Literal["gnc"] = "gnc"
+    tim_graph: Literal["chain", "complete"] = "chain"
+    vote: Literal["tls", "consensus"] = "tls"
+    refine: bool = True
+    gnc_iterations: int = 100
+    refine_iterations: int = 50
+    clique_nodes: int = 100_000_000
+    clique_seconds: float = 60.0
+    gnc_factor: float | Float[Array, ""] = 1.4
+    gnc_tolerance: float | Float[Array, ""] = 1e-6
+    scale_range: tuple[Any, Any] = field(default=(0.0, float("inf")))
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["rotation", "translation", "scale"], meta_fields=[]
+)
+@dataclass(frozen=True)
+class Pose:
+    """The similarity ``b = s R a + t`` from the source to the target frame, ``T_dst_src``.
+
+    Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind.
+    """
+
+    rotation: Float[Array, "*batch 3 3"]
+    translation: Float[Array, "*batch 3"]
+    scale: Float[Array, "*batch"]
+
+    @classmethod
+    def from_matrix(cls, matrix: Any) -> Pose:
+        """From ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is not a scaled rotation."""
+        xp = so3.namespace(matrix)
+        matrix = xp.asarray(matrix)
+        if matrix.shape[-2:] != (4, 4):
+            raise ValueError(f"a pose matrix has shape (4, 4), received {matrix.shape}")
+        block = matrix[..., :3, :3]
+        scale = xp.cbrt(xp.linalg.det(block))
+        if not isinstance(matrix, jax.core.Tracer):
+            square = np.einsum("...ji,...jk->...ik", block, block)
+            error = np.abs(square - np.asarray(scale)[..., None, None] ** 2 * np.eye(3)).max(initial=0)
+            if not (np.all(np.asarray(scale) > 0) and error <= 1e-3 * np.max(np.asarray(scale) ** 2)):
+                raise ValueError(
+                    "the upper left block is not a positive multiple of a rotation matrix: "
+                    "is the matrix transposed, sheared or mirrored?"
+                )
+        return cls(block / scale[..., None, None], matrix[..., :3, 3], scale)
+
+    @property
+    def matrix(self) -> Float[Array, "*batch 4 4"]:
+        """``T_dst_src = [s R, t; 0, 1]``."""
+        xp = so3.namespace(self.rotation, self.translation, self.scale)
+        scaled = self.scale[..., None, None] * self.rotation
+        top = xp.concatenate([scaled, self.translation[..., None]], axis=-1)
+        bottom = xp.broadcast_to(xp.asarray([0, 0, 0, 1], top.dtype), (*top.shape[:-2], 1, 4))
+        return xp.concatenate([top, bottom], axis=-2)
+
+    @property
+    def quat(self) -> Float[Array, "*batch 4"]:
+        """Unit quaternion of the rotation, scalar last."""
+        return so3.quat_from_rotation(self.rotation)
+
+    def apply(self, points: Float[Array, "*batch n 3"]) -> Float[Array, "*batch n 3"]:
+        """Source points (rows) in the target frame."""
+        rotated = so3.rotate(self.rotation, points)
+        return self.scale[..., None, None] * rotated + self.translation[..., None, :]
+
+    def inverse(self) -> Pose:
+        """The pose from the target to the source frame, ``T_src_dst``."""
+        xp = so3.namespace(self.rotation, self.translation, self.scale)
+        transposed = xp.swapaxes(self.rotation, -1, -2)
+        scale = 1 / self.scale
+        moved = so3.rotate(transposed, self.translation[..., None, :])[..., 0, :]
+        return Pose(transposed, -scale[..., None] * moved, scale)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """Composition: ``(T_c_b @ T_b_a).apply(p) == T_c_b.apply(T_b_a.apply(p))``."""
+        moved = self.apply(other.translation[..., None, :])[..., 0, :]
+        rotation = so3.rotate(self.rotation, other.rotation.swapaxes(-1, -2)).swapaxes(-1, -2)
+        return Pose(rotation, moved, self.scale * other.scale)
+
+    def as_scipy(self) -> Rotation:
+        """The rotation as ``scipy.spatial.transform.Rotation``."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_matrix(np.asarray(self.rotation))
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["scale_pairs", "clique", "rotation", "translation", "inliers", "refined"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class Selection:
+    """Which measurements to trust: the discrete half of the method. No gradient flows into it.
+
+    Attributes:
+        scale_pairs: TRIMs in the consensus of the scale: packed bit rows (bit t of word j in row
+            i is the pair (i, 32 j + t)), or a mask of the given pairs, or None: scale known.
+        clique: Members of the clique.
+        rotation: TIMs kept by the rotation stage: by their first member (chain), packed bit rows
+            (complete), or a mask of the given pairs.
+        translation: Points in the consensus of each axis of the translation.
+        inliers: Joint residual within c beta_i when refined, otherwise clique and all three axes.
+        refined: Whether the pose is the joint fit to ``inliers``.
+    """
+
+    scale_pairs: UInt32[Array, "n w"] | Bool[Array, " m"] | None
+    clique: Bool[Array, " n"]
+    rotation: Bool[Array, " k"] | UInt32[Array, "n w"]
+    translation: Bool[Array, "n 3"]
+    inliers: Bool[Array, " n"]
+    refined: Bool[Array, ""]
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "pose", "selection", "inliers", "status", "clique_size", "clique_upper_bound",
+        "clique_is_maximum", "excluded", "cost",
+    ],
+    meta_fields=[],
+)  # fmt: skip
+@dataclass(frozen=True)
+class Solution:
+    """The answer of ``solve``. Finite even when ``status`` says that it failed.
+
+    Attributes:
+        pose: Equal to ``refit(problem, selection)``.
+        selection: The sets behind the pose.
+        inliers: ``selection.inliers``, in the user's order.
+        status: A ``Status`` as int32; the first failure sticks.
+        clique_size: Members of the clique.
+        clique_upper_bound: No clique of the consistency graph is larger: proved.
+        clique_is_maximum: Whether the two are equal, which proves the maximum.
+        excluded: Rows left out because they hold NaN or infinity.
+        cost: The joint cost (6) of the pose [-].
+    """
+
+    pose: Pose
+    selection: Selection
+    inliers: Bool[Array, " n"]
+    status: Int[Array, ""]
+    clique_size: Int[Array, ""]
+    clique_upper_bound: Int[Array, ""]
+    clique_is_maximum: Bool[Array, ""]
+    excluded: Int[Array, ""]
+    cost: Float[Array, ""]
+
+    @property
+    def ok(self) -> Bool[Array, ""]:
+        """Whether the pose can be trusted. A proof elsewhere never turns this true."""
+        return self.status == Status.OK
