@@ -108,7 +108,7 @@ def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings 
     frozen_pose = lax.stop_gradient(pose)
     clique_size = jnp.sum(clique.members, dtype=jnp.int32)
     status = judge(
-        lax.stop_gradient(p), frozen_pose, selection.inliers, clique_size,
+        lax.stop_gradient(p), frozen_pose, selection.inliers, selection.clique, graph.edge_bits,
         converged=converged, pruned=settings.clique != "none",
     )  # fmt: skip
     return Solution(

@@ -136,33 +136,38 @@ def estimate_rotation(
         return lambda r2: jnp.clip(jnp.sqrt(height / jnp.maximum(r2, floor)) - gnc_mu, 0, 1)
 
     class Round(NamedTuple):
-        rotation: Array
-        gnc_mu: Array
+        correlation: Array
+        gnc_mu: Array  # of the weights behind `correlation`; infinite: all weights 1
         cost: Array
         settled: Array
         rounds: Array
 
-    everything = jnp.ones_like
-    first = so3.nearest_rotation(tims.measure(jnp.eye(3, dtype=dtype), everything).correlation)
-    start = tims.measure(first, everything)
-    excess = 2 * start.largest - cbar2
-    gnc_mu = jnp.where(excess > 0, cbar2 / jnp.where(excess > 0, excess, 1), 1)
-
     def one_round(state: Round) -> Round:
-        found = tims.measure(state.rotation, weigh(state.gnc_mu))
+        # One fit a round, and only one in the program: it is what takes longest to compile.
+        rotation = so3.nearest_rotation(state.correlation)
+        everything = tims.measure(rotation, jnp.ones_like)
+        excess = 2 * everything.largest - cbar2
+        opening = cbar2 / jnp.where(excess > 0, excess, 1)
+        is_first = state.rounds == 0
+        gnc_mu = jnp.where(is_first, opening, state.gnc_mu * gnc_factor)
+        found = tims.measure(rotation, weigh(gnc_mu))
         still = jnp.abs(found.cost - state.cost) <= tolerance * jnp.maximum(found.cost, cbar2)
-        return Round(
-            so3.nearest_rotation(found.correlation),
-            state.gnc_mu * gnc_factor,
-            found.cost,
-            still | ~found.soft,
-            state.rounds + 1,
-        )
+        all_agree = is_first & (excess <= 0)
+        kept = jnp.where(all_agree, state.correlation, found.correlation)
+        return Round(kept, gnc_mu, found.cost, all_agree | still | ~found.soft, state.rounds + 1)
 
-    initial = Round(first, gnc_mu, jnp.asarray(jnp.inf, dtype), excess <= 0, jnp.zeros((), jnp.int32))
+    start = tims.measure(jnp.eye(3, dtype=dtype), jnp.ones_like)
+    initial = Round(
+        start.correlation,
+        jnp.ones((), dtype),
+        jnp.asarray(jnp.inf, dtype),
+        jnp.zeros((), bool),
+        jnp.zeros((), jnp.int32),
+    )
     final = lax.while_loop(lambda s: ~s.settled & (s.rounds < iterations), one_round, initial)
-    kept = tims.members(final.rotation, lambda r2: (r2 <= cbar2).astype(dtype))
-    return Rotation(final.rotation, kept, final.settled)
+    rotation = so3.nearest_rotation(final.correlation)
+    kept = tims.members(rotation, lambda r2: (r2 <= cbar2).astype(dtype))
+    return Rotation(rotation, kept, final.settled)
 
 
 def ring_tims(clique: Bool[Array, " n"]) -> Int[Array, "n 2"]:
