@@ -36,10 +36,13 @@ def lengths_agree(
 ) -> Bool[Array, "*k"]:
     """| |b| - |a| | <= d from squared lengths: (A - B)^2 <= d^2 (2 (A + B) - d^2), or A + B <= d^2.
 
-    The same verdict without square roots, which would be most of the work.
+    The same verdict without square roots, which would be most of the work. Where one length is
+    nearly zero and the other nearly d, both sides are d^4 and their difference has a double root:
+    there the rounding of d^4 itself is added, which admits lengths up to d (1 + sqrt(8 eps)).
     """
     difference, total, tolerance2 = src_squared - dst_squared, src_squared + dst_squared, tolerance**2
-    return (difference**2 <= tolerance2 * (2 * total - tolerance2)) | (total <= tolerance2)
+    rounding = 8 * jnp.finfo(total.dtype).eps * tolerance2**2
+    return (difference**2 <= tolerance2 * (2 * total - tolerance2) + rounding) | (total <= tolerance2)
 
 
 def consistency_graph(

@@ -1,0 +1,1 @@
+"""What the library is worth, measured: ``python -m benchmarks [--only NAME ...] [--quick]``."""

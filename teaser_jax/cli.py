@@ -1,0 +1,278 @@
+"""The command line: ``teaser-jax register MATCHES`` and ``teaser-jax demo``.
+
+Exit codes: 0, the answer can be trusted; 1, there is no trustworthy answer and the status says
+why; 2, bad input, with one line on stderr that says what is wrong and what to do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+import teaser_jax as tj
+from teaser_jax.files import FileError, one_line, read_matches, write_pose
+
+OK, UNTRUSTED, BAD_INPUT = 0, 1, 2
+
+
+class BadInput(Exception):
+    """Something the caller can put right; ends the command with one line and exit code 2."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Args:
+        argv: Arguments without the program's name; None: those of the process.
+    """
+    try:
+        arguments = _parser().parse_args(argv)
+        code = arguments.run(arguments)
+        sys.stdout.flush()
+        return code
+    except (BadInput, FileError) as error:
+        print(f"teaser-jax: {one_line(error, 600)}", file=sys.stderr)
+        return BAD_INPUT
+    except BrokenPipeError:  # the reader of a pipe has left: nobody is there to be told
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        return 130
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise BadInput(f"{message}; see {self.prog} --help")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="teaser-jax",
+        description="Robust registration of matched 3-D points.",
+        epilog="Exit codes: 0 ok, 1 no trustworthy answer (the status says why), 2 bad input.",
+    )
+    parser.add_argument("--version", action="version", version=f"teaser-jax {tj.__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    register = commands.add_parser("register", help="find the pose behind a file of matches")
+    register.set_defaults(run=_register)
+    register.add_argument(
+        "matches", metavar="MATCHES", type=Path,
+        help=".npz with arrays src and dst, or text or CSV with six columns",
+    )  # fmt: skip
+    register.add_argument(
+        "--noise-bound", type=float, metavar="B",
+        help="largest error of a right match, in the unit of the points (default: noise_bound in the file)",
+    )  # fmt: skip
+    register.add_argument(
+        "--scale", type=_scale, default=1.0, metavar="S|estimate", help="the known scale (default: 1), or estimate it"
+    )
+    register.add_argument("--cbar2", type=float, default=1.0, metavar="C", help="truncation of the cost (default: 1)")
+    register.add_argument(
+        "--clique", choices=("exact", "greedy", "networkx", "none"), default=tj.Settings().clique,
+        help="how to prune wrong matches (default: exact)",
+    )  # fmt: skip
+    register.add_argument("--json", action="store_true", help="print the answer as JSON")
+    register.add_argument("--plot", type=Path, metavar="PNG", help="write a picture of the answer, good or bad")
+    register.add_argument(
+        "-o", "--output", type=Path, metavar="TXT",
+        help="write T_dst_src, 4 x 4; unless the answer can be trusted there is no such file afterwards",
+    )  # fmt: skip
+
+    demo = commands.add_parser("demo", help="register 1000 matches of which 950 are wrong, and draw the answer")
+    demo.set_defaults(run=_demo)
+    demo.add_argument("--plot", type=Path, default=Path("demo.png"), metavar="PNG", help="default: demo.png")
+    demo.add_argument("--seed", type=int, default=0, help="default: 0")
+    return parser
+
+
+def _scale(text: str) -> float | None:
+    try:
+        return None if text == "estimate" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number nor the word estimate") from None
+
+
+def _register(arguments: argparse.Namespace) -> int:
+    source, output, plot = arguments.matches, arguments.output, arguments.plot
+    for path in (output, plot):
+        _check_writable(path, source)
+    if plot is not None:
+        _check_picture(plot)
+    # A file of an earlier run must not pass for this run's answer.
+    _remove(output)
+    matches = read_matches(source)
+    known = dict(matches.known)
+    if arguments.noise_bound is not None:
+        known["noise_bound"] = arguments.noise_bound
+    if "noise_bound" not in known:
+        raise BadInput(
+            "--noise-bound is missing: give the largest error of a right match, in the unit of the points"
+        )
+    start = time.perf_counter()
+    result = _answer(source, matches.src, matches.dst, arguments, known)
+    seconds = time.perf_counter() - start
+
+    if arguments.json:
+        print(json.dumps(_report(result, matches.truth, seconds), indent=2, allow_nan=False))
+    else:
+        print(result)
+        if matches.truth is not None:
+            print(_errors(result.pose, matches.truth, "T_dst_src of the file"))
+    if plot is not None:
+        _draw(plot, matches.src, matches.dst, result)
+    if output is not None and result.ok:
+        _written(output, lambda: write_pose(output, result.pose))
+    elif output is not None:
+        print(f"teaser-jax: {output} not written: {result.status.name}", file=sys.stderr)
+    return OK if result.ok else UNTRUSTED
+
+
+def _answer(
+    path: Path, src: Any, dst: Any, arguments: argparse.Namespace, known: dict[str, Any]
+) -> tj.Registration:
+    settings = tj.Settings(clique=arguments.clique)
+    try:
+        return tj.register(
+            src, dst, scale=arguments.scale, cbar2=arguments.cbar2, settings=settings, **known
+        )
+    except ValueError as error:
+        raise BadInput(f"{path}: {error}") from error
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise BadInput(
+            f"{path}: {len(src)} matches need more memory than there is: give fewer, the best ones first"
+        ) from error
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    _check_writable(arguments.plot, None)
+    problem = tj.synthetic.random_problem(arguments.seed)
+    wrong = int((~problem.inliers).sum())
+    print(f"A teapot: {len(problem.src)} matches, {wrong} of them wrong (seed {arguments.seed}).\n")
+    profile = tj.profile(problem.src, problem.dst, noise_bound=problem.noise_bound)
+    result = profile.result
+    precision, recall = tj.metrics.precision_recall(result.inliers, problem.inliers)
+    print(result)
+    print()
+    print(_errors(result.pose, problem.truth, "truth"))
+    print(f"  inliers      {precision:.1%} of those found are right, {recall:.1%} of the right ones are found\n")
+    print(f"Time of each stage\n{profile}\n")
+    try:
+        _check_picture(arguments.plot)
+    except BadInput as error:
+        print(f"No picture: {error}.", file=sys.stderr)
+    else:
+        _draw(arguments.plot, problem.src, problem.dst, result)
+        print(f"Picture: {arguments.plot}")
+    return OK if result.ok else UNTRUSTED
+
+
+def _errors(pose: tj.Pose, truth: tj.Pose, name: str) -> str:
+    angle = math.degrees(tj.metrics.rotation_error(pose, truth))
+    return (
+        f"Error against the {name}\n"
+        f"  rotation     {angle:.4g} deg\n"
+        f"  translation  {float(tj.metrics.translation_error(pose, truth)):.4g}\n"
+        f"  scale        {float(tj.metrics.scale_error(pose, truth)):.4g}"
+    )
+
+
+def _report(result: tj.Registration, truth: tj.Pose | None, seconds: float) -> dict[str, Any]:
+    """The answer as plain numbers; those that are not finite become null, which JSON can hold."""
+    pose, solution = result.pose, result.solution
+    report = {
+        "ok": result.ok,
+        "status": result.status.name,
+        "advice": result.status.advice,
+        "pose": {
+            "scale": _plain(pose.scale),
+            "rotation": _plain(pose.rotation),
+            "quaternion_xyzw": _plain(pose.quat),
+            "translation": _plain(pose.translation),
+            "T_dst_src": _plain(pose.matrix),
+        },
+        "matches": len(result.inliers),
+        "excluded": int(solution.excluded),
+        "inliers": np.flatnonzero(result.inliers).tolist(),
+        "clique": {
+            "size": int(solution.clique_size),
+            "upper_bound": int(solution.clique_upper_bound),
+            "is_maximum": bool(solution.clique_is_maximum),
+        },
+        "cost": _plain(solution.cost),
+        "seconds": round(seconds, 6),
+    }
+    if truth is not None:
+        report["error"] = {
+            "rotation_deg": _plain(np.degrees(tj.metrics.rotation_error(pose, truth))),
+            "translation": _plain(tj.metrics.translation_error(pose, truth)),
+            "scale": _plain(tj.metrics.scale_error(pose, truth)),
+        }
+    return report
+
+
+def _plain(values: Any) -> Any:
+    listed = np.asarray(values, float).tolist()
+
+    def finite(x: Any) -> Any:
+        return [finite(y) for y in x] if isinstance(x, list) else (x if math.isfinite(x) else None)
+
+    return finite(listed)
+
+
+def _draw(path: Path, src: Any, dst: Any, result: tj.Registration) -> None:
+    from teaser_jax.plots import plot_registration
+
+    _written(path, lambda: plot_registration(src, dst, result).savefig(path))
+
+
+def _written(path: Path, write: Any) -> None:
+    try:
+        write()
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _check_writable(path: Path | None, source: Path | None) -> None:
+    """Say before the work, not after it, that its answer has no place to go."""
+    if path is None:
+        return
+    folder = path.parent
+    if path.is_dir():
+        raise BadInput(f"{path}: is a folder: name a file to write")
+    if not folder.is_dir():
+        raise BadInput(f"{path}: the folder {folder} does not exist: make it first")
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise BadInput(f"{path}: cannot be written: no permission")
+    if source is not None and path.exists() and source.exists() and path.samefile(source):
+        raise BadInput(f"{path}: is the file of matches: name another one to write")
+
+
+def _check_picture(path: Path) -> None:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise BadInput("pictures need matplotlib: pip install 'teaser-jax[viz]'") from None
+    kinds = Figure().canvas.get_supported_filetypes()
+    if path.suffix.lower().lstrip(".") not in kinds:
+        raise BadInput(f"{path}: unknown kind of picture: end the name in .png, .pdf or .svg")
+
+
+def _remove(path: Path | None) -> None:
+    if path is not None:
+        _written(path, lambda: path.unlink(missing_ok=True))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""Matches from files and poses to files. Whatever is wrong with a file is said in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from teaser_jax.types import Pose
+
+TEXT = (".txt", ".csv", ".tsv", ".dat", ".xyz")
+
+
+class FileError(ValueError):
+    """A file that cannot be used. The message is one line: what is wrong and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """What a file of matches holds; ``None`` where it says nothing.
+
+    Attributes:
+        src, dst: (n, 3) matched points, row i with row i.
+        known: Further arguments of ``register``: noise_bound, mask, confidence, pairs.
+        truth: The pose to compare with, from ``T_dst_src``.
+    """
+
+    src: np.ndarray
+    dst: np.ndarray
+    known: dict[str, np.ndarray]
+    truth: Pose | None = None
+
+
+def read_matches(path: str | PathLike[str]) -> Matches:
+    """Matches from ``.npz`` (arrays ``src`` and ``dst``) or text (six columns).
+
+    An archive may also hold ``noise_bound``, ``mask``, ``confidence``, ``pairs`` and ``T_dst_src``.
+    Text has a row for each match, x y z of the source point, then of the target point, separated
+    by white space, commas, semicolons, tabs or bars; one line of column names and ``#`` comments
+    are skipped. The points are checked by ``register``.
+
+    Raises:
+        FileError: If there is no such file, or it is broken, or holds something else.
+    """
+    path = Path(path)
+    read = _read_text if path.suffix.lower() in TEXT else _read_npz
+    if read is _read_npz and path.suffix.lower() != ".npz":
+        known = ", ".join((".npz", *TEXT))
+        raise FileError(f"{path}: unknown extension '{path.suffix}': give matches as one of {known}.")
+    try:
+        if path.is_dir():
+            raise FileError(f"{path}: is a folder: name the file of matches in it.")
+        return read(path)
+    except FileNotFoundError:
+        raise FileError(f"{path}: no such file.") from None
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror or one_line(error)}.") from error
+
+
+def write_pose(path: str | PathLike[str], pose: Pose) -> None:
+    """``T_dst_src`` as four lines of four numbers, which ``numpy.loadtxt`` reads back exactly.
+
+    The file appears whole or not at all. Raises OSError if it cannot be written.
+    """
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        np.savetxt(partial, pose.matrix, fmt="%.17g")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def one_line(message: object, limit: int = 300) -> str:
+    """A message without line breaks and of bearable length."""
+    text = "".join(c if c.isprintable() else " " for c in str(message))
+    text = " ".join(text.split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def _read_npz(path: Path) -> Matches:
+    arrays = _guarded(path, "is no .npz archive, or is broken", lambda: _arrays(path))
+    for name in ("src", "dst"):
+        if name not in arrays:
+            found = ", ".join(sorted(arrays)) or "nothing"
+            raise FileError(
+                f"{path}: holds no array '{name}' (found: {one_line(found, 80)}): "
+                "save one with numpy.savez(path, src=src, dst=dst)."
+            )
+    names = ("noise_bound", "mask", "confidence", "pairs")
+    known = {name: arrays[name] for name in names if name in arrays}
+    truth = None
+    if "T_dst_src" in arrays:
+        truth = _guarded(
+            path, "T_dst_src is no pose", lambda: Pose.from_matrix(_real(arrays["T_dst_src"]))
+        )
+    return Matches(arrays["src"], arrays["dst"], known, truth)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    # Pickled objects would run code from the file.
+    with np.load(path, allow_pickle=False) as archive:
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("one array without a name")
+        return {name: archive[name] for name in archive.files}
+
+
+def _read_text(path: Path) -> Matches:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise FileError(f"{path}: is not text: expected six columns of numbers.") from None
+    rows = [line for line in lines if line.split("#")[0].strip()]
+    delimiter = next((d for d in ";,\t|" if rows and d in rows[0]), None)
+    if rows and not any(_is_number(field) for field in rows[0].split(delimiter)):
+        rows = rows[1:]  # column names; a first row that is partly numbers is an error instead
+    if not rows:
+        raise FileError(f"{path}: holds no match: expected six numbers a row.")
+    table = _guarded(
+        path,
+        "is no table of numbers",
+        lambda: np.loadtxt(rows, delimiter=delimiter, comments="#", quotechar='"', ndmin=2),
+    )
+    if table.shape[1] != 6:
+        raise FileError(
+            f"{path}: has {table.shape[1]} columns: expected six, x y z of the source point, then of the target."
+        )
+    return Matches(table[:, :3], table[:, 3:], {})
+
+
+def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
+    """The result of reading, or a FileError.
+
+    Broken files make zipfile, zlib, struct, ast and numpy raise nearly anything, in every
+    version something else: so everything is caught here, and nowhere else.
+    """
+    try:
+        return read()
+    except OSError:
+        raise
+    except Exception as error:
+        reason = one_line(error) or type(error).__name__
+        raise FileError(f"{path}: {what} ({reason}).") from error
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field.strip().strip('"'))
+    except ValueError:
+        return False
+    return True
+
+
+def _real(array: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise ValueError("not all finite numbers")
+    return array.astype(np.float64)
