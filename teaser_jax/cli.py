@@ -74,21 +74,31 @@ def _parser() -> argparse.ArgumentParser:
         help="largest error of a right match, in the unit of the points (default: noise_bound in the file)",
     )  # fmt: skip
     register.add_argument(
-        "--scale", type=_scale, default=1.0, metavar="S|estimate", help="the known scale (default: 1), or estimate it"
+        "--scale",
+        type=_scale,
+        default=1.0,
+        metavar="S|estimate",
+        help="the known scale (default: 1), or estimate it",
     )
-    register.add_argument("--cbar2", type=float, default=1.0, metavar="C", help="truncation of the cost (default: 1)")
+    register.add_argument(
+        "--cbar2", type=float, default=1.0, metavar="C", help="truncation of the cost (default: 1)"
+    )
     register.add_argument(
         "--clique", choices=("exact", "greedy", "networkx", "none"), default=tj.Settings().clique,
         help="how to prune wrong matches (default: exact)",
     )  # fmt: skip
     register.add_argument("--json", action="store_true", help="print the answer as JSON")
-    register.add_argument("--plot", type=Path, metavar="PNG", help="write a picture of the answer, good or bad")
+    register.add_argument(
+        "--plot", type=Path, metavar="PNG", help="write a picture of the answer, good or bad"
+    )
     register.add_argument(
         "-o", "--output", type=Path, metavar="TXT",
         help="write T_dst_src, 4 x 4; unless the answer can be trusted there is no such file afterwards",
     )  # fmt: skip
 
-    demo = commands.add_parser("demo", help="register 1000 matches of which 950 are wrong, and draw the answer")
+    demo = commands.add_parser(
+        "demo", help="register 1000 matches of which 950 are wrong, and draw the answer"
+    )
     demo.set_defaults(run=_demo)
     demo.add_argument("--plot", type=Path, default=Path("demo.png"), metavar="PNG", help="default: demo.png")
     demo.add_argument("--seed", type=int, default=0, help="default: 0")
@@ -123,7 +133,7 @@ def _register(arguments: argparse.Namespace) -> int:
     seconds = time.perf_counter() - start
 
     if arguments.json:
-        print(json.dumps(_report(result, matches.truth, seconds), indent=2, allow_nan=False))
+        print(json.dumps(_report(result, matches.truth, seconds), allow_nan=False))
     else:
         print(result)
         if matches.truth is not None:
@@ -142,9 +152,7 @@ def _answer(
 ) -> tj.Registration:
     settings = tj.Settings(clique=arguments.clique)
     try:
-        return tj.register(
-            src, dst, scale=arguments.scale, cbar2=arguments.cbar2, settings=settings, **known
-        )
+        return tj.register(src, dst, scale=arguments.scale, cbar2=arguments.cbar2, settings=settings, **known)
     except ValueError as error:
         raise BadInput(f"{path}: {error}") from error
     except (MemoryError, RuntimeError) as error:
@@ -166,7 +174,9 @@ def _demo(arguments: argparse.Namespace) -> int:
     print(result)
     print()
     print(_errors(result.pose, problem.truth, "truth"))
-    print(f"  inliers      {precision:.1%} of those found are right, {recall:.1%} of the right ones are found\n")
+    print(
+        f"  inliers      {precision:.1%} of those found are right, {recall:.1%} of the right ones are found\n"
+    )
     print(f"Time of each stage\n{profile}\n")
     try:
         _check_picture(arguments.plot)

@@ -96,9 +96,7 @@ def _read_npz(path: Path) -> Matches:
     known = {name: arrays[name] for name in names if name in arrays}
     truth = None
     if "T_dst_src" in arrays:
-        truth = _guarded(
-            path, "T_dst_src is no pose", lambda: Pose.from_matrix(_real(arrays["T_dst_src"]))
-        )
+        truth = _guarded(path, "T_dst_src is no pose", lambda: Pose.from_matrix(_real(arrays["T_dst_src"])))
     return Matches(arrays["src"], arrays["dst"], known, truth)
 
 
@@ -128,7 +126,8 @@ def _read_text(path: Path) -> Matches:
     )
     if table.shape[1] != 6:
         raise FileError(
-            f"{path}: has {table.shape[1]} columns: expected six, x y z of the source point, then of the target."
+            f"{path}: has {table.shape[1]} columns: expected six, x y z of the source point, "
+            "then of the target."
         )
     return Matches(table[:, :3], table[:, 3:], {})
 

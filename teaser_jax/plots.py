@@ -141,7 +141,8 @@ def plot_graph(edge_bits: UInt32[np.ndarray, "n w"], clique: Bool[np.ndarray, " 
     rank = np.arange(n)
     right.bar(rank, degree[order], width=1.0, color=np.where(clique[order], GOOD, PALE))
     right.axhline(size - 1, color=GOOD, linewidth=1, linestyle=":")
-    _label(right, f"degree of each match; the clique has {size}", "match (clique first)", "matches it agrees with")
+    title = f"degree of each match; the clique has {size}"
+    _label(right, title, "match (clique first)", "matches it agrees with")
     right.set_xlim(-0.5, n - 0.5)
     return figure
 
@@ -174,8 +175,9 @@ def plot_clique(
     axes = figure.subplots()
     _segments(axes, place[i[outside]], place[j[outside]], PALE, 0.3, 0.5)
     _segments(axes, place[i[inside]], place[j[inside]], GOOD, 0.5, min(1.0, 0.08 + 8 / max(size, 1)))
-    axes.scatter(*place[~clique].T, s=6, color=INK, linewidths=0, alpha=0.6)
-    axes.scatter(*place[clique].T, s=16, color=GOOD, linewidths=0, zorder=3)
+    x, y = place.T
+    axes.scatter(x[~clique], y[~clique], s=6, color=INK, linewidths=0, alpha=0.6)
+    axes.scatter(x[clique], y[clique], s=16, color=GOOD, linewidths=0, zorder=3)
     axes.set_title(f"{size} of {n} matches agree pairwise", fontsize=10, color=INK)
     axes.set_aspect("equal")
     axes.set_axis_off()
@@ -281,11 +283,11 @@ def plot_refinement(
 def _figure(size: tuple[float, float]) -> Figure:
     try:
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
     except ImportError as error:
         raise ImportError("plots need matplotlib: pip install 'teaser-jax[viz]'") from error
-    figure = Figure(figsize=size, dpi=150, facecolor="white", layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)
-    return figure
+    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+    return Figure(figsize=size, dpi=150, facecolor="white", layout=layout)
 
 
 def _eye(points: np.ndarray, view: tuple[float, float] | None) -> np.ndarray:
@@ -332,7 +334,9 @@ def _segments(axes: Axes, start: np.ndarray, end: np.ndarray, color: str, width:
 
 def _frame(axes: Axes, points: np.ndarray, title: str, color: str) -> None:
     """Equal axes around the points, the farthest left out, with a bar for the length unit."""
-    corners = np.quantile(points[:, :2], [0.002, 0.998], axis=0) if len(points) else np.array([[-1, -1], [1, 1]])
+    corners = (
+        np.quantile(points[:, :2], [0.002, 0.998], axis=0) if len(points) else np.array([[-1, -1], [1, 1]])
+    )
     middle, half = corners.mean(axis=0), np.ptp(corners, axis=0) / 2
     # One shape for every panel, so that neighbours stand in line.
     height = 1.16 * max(half[0] / PANEL_SHAPE, half[1], 1e-12)
@@ -345,7 +349,8 @@ def _frame(axes: Axes, points: np.ndarray, title: str, color: str) -> None:
     length = _round_length(width / 3)
     x, y = low + 0.04 * height
     axes.plot([x, x + length], [y, y], color=INK, linewidth=2, solid_capstyle="butt")
-    axes.text(x + length / 2, y + 0.02 * height, f"{length:g}", ha="center", va="bottom", fontsize=8, color=INK)
+    above = (x + length / 2, y + 0.02 * height)
+    axes.text(*above, f"{length:g}", ha="center", va="bottom", fontsize=8, color=INK)
     axes.set_title(title, fontsize=11, color=color)
 
 
@@ -361,11 +366,13 @@ def _edges(edge_bits: np.ndarray, clique: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _label(axes: Axes, title: str, x: str, y: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     axes.set_title(title, fontsize=10, color=INK)
     axes.set_xlabel(x, fontsize=9, color=INK)
     axes.set_ylabel(y, fontsize=9, color=INK)
     axes.tick_params(labelsize=8, colors=INK)
-    axes.yaxis.get_major_locator().set_params(integer=True)
+    axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
 
@@ -378,7 +385,8 @@ def _legend(figure: Figure, colors: dict[str, str]) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=color, marker="o", markersize=5, linestyle="-" if "match" in name else "none", label=name)
+        Line2D([], [], color=color, marker="" if name == "rejected matches" else "o", markersize=5,
+               linestyle="-" if name in ("inliers", "rejected matches") else "", label=name)
         for name, color in colors.items()
-    ]
+    ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)

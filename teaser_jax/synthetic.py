@@ -7,7 +7,7 @@ is a small teapot, a solid of blended primitives without any symmetry, so that i
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -183,7 +183,7 @@ def sample_model(rng: np.random.Generator, n: int, model: Points | Mesh | None =
     else:
         pool = teapot(max(n, 20_000)) if model is None else np.asarray(model, float)
         if n > len(pool):
-            raise ValueError(f"the model has {len(pool)} points, fewer than n = {n}: give a Mesh to sample from.")
+            raise ValueError(f"the model has {len(pool)} points, fewer than n = {n}: give a Mesh instead.")
         points = pool[rng.choice(len(pool), n, replace=False)]
     low = points.min(axis=0)
     extent = (points.max(axis=0) - low).max()
@@ -257,7 +257,7 @@ def _right_matches(
         raise ValueError(f"received n = {n} and sigma = {sigma}: expected n above 0, sigma 0 or above.")
     bound = BOUND_PER_SIGMA * sigma if noise_bound is None else float(noise_bound)
     if bound < sigma:
-        raise ValueError(f"noise_bound {bound} is below sigma {sigma}: almost all noise would be drawn again.")
+        raise ValueError(f"noise_bound {bound} is below sigma {sigma}: most noise would be drawn again.")
     src = sample_model(rng, n, model)
     if truth is None:
         drawn = rng.uniform(*scale) if isinstance(scale, tuple) else scale
@@ -266,7 +266,12 @@ def _right_matches(
     return SyntheticProblem(src, dst, truth, np.ones(n, bool), bound)
 
 
-def _with_outliers(rng, right: SyntheticProblem, rate: float, draw) -> SyntheticProblem:
+def _with_outliers(
+    rng: np.random.Generator,
+    right: SyntheticProblem,
+    rate: float,
+    draw: Callable[[Int[np.ndarray, " k"]], Points],
+) -> SyntheticProblem:
     if not 0 <= rate <= 1:
         raise ValueError(f"outlier_rate is {rate}: expected a share from 0 to 1.")
     n = len(right.src)
@@ -274,7 +279,9 @@ def _with_outliers(rng, right: SyntheticProblem, rate: float, draw) -> Synthetic
     dst, inliers = right.dst.copy(), right.inliers.copy()
     inliers[wrong] = False
     place, todo = right.truth.apply(right.src), wrong
-    while todo.size:  # a wrong match that happens to be right is drawn again
+    for _ in range(1000):  # a wrong match that happens to be right is drawn again
         dst[todo] = draw(todo)
         todo = todo[np.linalg.norm(dst[todo] - place[todo], axis=1) <= right.noise_bound]
-    return SyntheticProblem(right.src, dst, right.truth, inliers, right.noise_bound)
+        if not todo.size:
+            return SyntheticProblem(right.src, dst, right.truth, inliers, right.noise_bound)
+    raise ValueError(f"noise_bound {right.noise_bound} spans the target: no match could be wrong.")

@@ -18,7 +18,9 @@ import numpy as np
 log = logging.getLogger("teaser_jax")
 
 SLICE = 2_000_000  # word operations between two looks at the clock: one or two milliseconds
-SEEDS = 16
+# Many seeds: a better clique before the edges are thinned saves far more than it costs. On a real
+# graph of 5 700 matches and 15 % density 16, 64 and 512 seeds took 14, 6 and 4 s in all.
+SEEDS = 512
 _kernels = None
 _loading = threading.Lock()
 
@@ -131,6 +133,8 @@ class _Search:
             size = self.kernels.grow_clique(self.rows, seed, clique)
             if size > len(self.best):
                 self.best, improved = self.names[clique[:size]], True
+                if self.lower_upper(self.upper):
+                    break
             self.check_budget()
         return improved
 
