@@ -101,7 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.set_defaults(run=_demo)
     demo.add_argument("--plot", type=Path, default=Path("demo.png"), metavar="PNG", help="default: demo.png")
-    demo.add_argument("--seed", type=int, default=0, help="default: 0")
+    demo.add_argument("--seed", type=_seed, default=0, help="default: 0")
     return parser
 
 
@@ -110,6 +110,12 @@ def _scale(text: str) -> float | None:
         return None if text == "estimate" else float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is neither a number nor the word estimate") from None
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text} is no seed: give a whole number, 0 or above")
+    return int(text)
 
 
 def _register(arguments: argparse.Namespace) -> int:

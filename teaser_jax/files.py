@@ -101,8 +101,9 @@ def _read_npz(path: Path) -> Matches:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
-    # Pickled objects would run code from the file.
-    with np.load(path, allow_pickle=False) as archive:
+    # numpy closes only files that it did not open; pickled objects would run code from the file.
+    with path.open("rb") as file:
+        archive = np.load(file, allow_pickle=False)
         if not isinstance(archive, np.lib.npyio.NpzFile):
             raise ValueError("one array without a name")
         return {name: archive[name] for name in archive.files}

@@ -49,25 +49,30 @@ def make_problem(
 
     Gradients: exact in ``src``, ``dst``, ``noise_bound``, ``scale`` and ``confidence``.
     """
+    # Everything concrete is read into numpy and checked there: under jit, jnp would trace it.
     src, dst = _points(src, "src"), _points(dst, "dst")
     if src.shape[0] != dst.shape[0]:
         raise ValueError(
             f"src has {src.shape[0]} rows and dst has {dst.shape[0]}: rows are matches, row i of src "
             "with row i of dst. Match the clouds first and index both with the matches."
         )
-    n, dtype = src.shape[0], jnp.result_type(src, dst)
-    src, dst = src.astype(dtype), dst.astype(dtype)
-    if n == 0:
-        raise ValueError("src and dst are empty: give at least 3 matches (rows).")
-    noise_bound = _numbers(noise_bound, "noise_bound", n, dtype)
-    cbar2 = _scalar(cbar2, "cbar2", dtype)
-    scale = None if scale is None else _scalar(scale, "scale", dtype)
-    mask = jnp.ones(n, bool) if mask is None else _mask(mask, n)
-    confidence = jnp.ones(n, dtype) if confidence is None else _numbers(confidence, "confidence", n, dtype)
-    if pairs is not None:
-        pairs = _pairs(pairs, n)
-    _check_values(src, dst, noise_bound, mask, confidence)
-    return Problem(src, dst, noise_bound, cbar2, mask, confidence, scale, pairs)
+    n = src.shape[0]
+    dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
+    noise_bound = _numbers(noise_bound, "noise_bound", n)
+    confidence = np.ones(n) if confidence is None else _numbers(confidence, "confidence", n)
+    mask = np.ones(n, bool) if mask is None else _mask(mask, n)
+    pairs = None if pairs is None else _pairs(pairs, n)
+    cbar2 = _scalar(cbar2, "cbar2")
+    scale = None if scale is None else _scalar(scale, "scale")
+    _check_values(src, dst, noise_bound, mask, confidence, dtype)
+
+    def ready(x: Any) -> jax.Array:
+        return jnp.asarray(x, dtype)
+
+    return Problem(
+        ready(src), ready(dst), ready(noise_bound), ready(cbar2), jnp.asarray(mask), ready(confidence),
+        None if scale is None else ready(scale), None if pairs is None else jnp.asarray(pairs, jnp.int32),
+    )  # fmt: skip
 
 
 def stack_problems(problems: Sequence[Problem]) -> Problem:
@@ -121,20 +126,6 @@ def is_traced(*values: Any) -> bool:
     return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
 
 
-def _as_array(value: Any, name: str) -> Any:
-    """A JAX array of a real dtype from anything with __array__ or __dlpack__."""
-    if isinstance(value, jax.Array):
-        array = value
-    else:
-        array = as_numpy(value, name)
-    if array.dtype.kind not in "fiub" and array.dtype != jnp.bfloat16:
-        raise ValueError(
-            f"{name} has dtype {array.dtype}: expected real numbers. Convert it, for instance with "
-            "numpy.asarray(x, dtype=float)."
-        )
-    return array
-
-
 def as_numpy(value: Any, name: str) -> np.ndarray:
     """A numpy view or copy of anything with ``__array__`` or ``__dlpack__``, or nested lists."""
     try:
@@ -148,48 +139,65 @@ def as_numpy(value: Any, name: str) -> np.ndarray:
         ) from error
 
 
+def _read(value: Any, name: str) -> Any:
+    """Real numbers as a tracer, or as a numpy array in the machine's own byte order."""
+    if is_traced(value):
+        array = value
+    else:
+        array = as_numpy(value, name)
+    if array.dtype.kind not in "fiub" and array.dtype != jnp.bfloat16:
+        raise ValueError(
+            f"{name} has dtype {array.dtype}: expected real numbers. Convert it, for instance with "
+            "numpy.asarray(x, dtype=float)."
+        )
+    return array
+
+
 def _floats(value: Any, name: str) -> Any:
-    array = _as_array(value, name)
+    array = _read(value, name)
     if array.dtype.kind == "b":
         raise ValueError(f"{name} holds truth values: expected real numbers.")
-    array = jnp.asarray(array)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+    if is_traced(array):
+        return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+    known = array.dtype.kind != "f" or array.dtype.itemsize > 8 or not array.dtype.isnative
+    return array.astype(np.float64) if known else array
 
 
 def _points(value: Any, name: str) -> Any:
-    shape = np.shape(value) if not hasattr(value, "shape") else tuple(value.shape)
+    array = _floats(value, name)
+    shape = array.shape
+    if 0 in shape:
+        raise ValueError(f"{name} is empty (shape {shape}): give at least 3 matches (rows).")
     if len(shape) == 2 and shape[0] == 3 and shape[1] != 3:
         raise ValueError(f"{name} has shape {shape}: points are rows, so pass {name}.T of shape (n, 3).")
     if len(shape) != 2 or shape[1] != 3:
-        if 0 in shape:
-            raise ValueError(f"{name} is empty (shape {shape}): give at least 3 matches (rows).")
         raise ValueError(f"{name} has shape {shape}: expected (n, 3), one point a row.")
-    return _floats(value, name)
+    return array
 
 
-def _numbers(value: Any, name: str, n: int, dtype: Any) -> Any:
+def _numbers(value: Any, name: str, n: int) -> Any:
     array = _floats(value, name)
     if array.shape not in ((), (n,)):
         raise ValueError(f"{name} has shape {array.shape}: expected one number or one a match, ({n},).")
-    return jnp.broadcast_to(array.astype(dtype), (n,))
+    return jnp.broadcast_to(array, (n,)) if is_traced(array) else np.broadcast_to(array, (n,))
 
 
-def _scalar(value: Any, name: str, dtype: Any) -> Any:
+def _scalar(value: Any, name: str) -> Any:
     array = _floats(value, name)
     if array.shape != ():
         raise ValueError(f"{name} has shape {array.shape}: expected one number.")
     if not is_traced(array) and not (np.isfinite(array) and array > 0):
         raise ValueError(f"{name} is {array}: expected a number above 0.")
-    return array.astype(dtype)
+    return array
 
 
 def _mask(value: Any, n: int) -> Any:
-    array = _as_array(value, "mask")
+    array = _read(value, "mask")
     if array.shape != (n,) or array.dtype.kind != "b":
         raise ValueError(
             f"mask has shape {array.shape} and dtype {array.dtype}: expected ({n},) truth values, one a match."
         )
-    return jnp.asarray(array)
+    return array
 
 
 def _pairs(value: Any, n: int) -> Any:
@@ -198,7 +206,7 @@ def _pairs(value: Any, n: int) -> Any:
         if not all(isinstance(x, (int, np.integer)) for x in value.ravel()):
             raise ValueError("the nodes of the pairs graph must be row numbers (integers).")
         value = value.astype(np.int64)
-    array = _as_array(value, "pairs")
+    array = _read(value, "pairs")
     if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
         raise ValueError(
             f"pairs has shape {array.shape} and dtype {array.dtype}: expected (m, 2) integers, "
@@ -208,37 +216,33 @@ def _pairs(value: Any, n: int) -> Any:
         low, high = int(np.min(array)), int(np.max(array))
         if low < 0 or high >= n:
             raise ValueError(f"pairs refer to rows {low} to {high}, but rows run from 0 to {n - 1}.")
-    return jnp.asarray(array).astype(jnp.int32)
+    return array
 
 
-def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: Any) -> None:
+def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: Any, dtype: Any) -> None:
     """Checks of what is concrete; anything traced is left to the solver."""
     if not is_traced(noise_bound, mask):
-        bounds = np.asarray(noise_bound)[np.asarray(mask)]
-        if bounds.size and not np.all(bounds > 0):
-            bad = bounds[~(bounds > 0)][0]
+        bounds = noise_bound[mask]
+        if not np.all(bounds > 0):
             raise ValueError(
-                f"noise_bound contains {bad}: it is the largest error of a right match, a number above 0 "
-                "in the unit of the points."
+                f"noise_bound contains {bounds[~(bounds > 0)][0]}: it is the largest error of a right match, "
+                "a number above 0 in the unit of the points."
             )
         if not np.all(np.isfinite(bounds)):
             raise ValueError("noise_bound contains infinity: give the largest error of a right match.")
-    if not is_traced(confidence):
-        values = np.asarray(confidence)
-        if not np.all(values >= 0) or not np.all(np.isfinite(values)):
-            raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
+    if not is_traced(confidence) and not np.all((confidence >= 0) & np.isfinite(confidence)):
+        raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
     if is_traced(src, dst, mask, noise_bound):
         return
-    a, b, use = np.asarray(src), np.asarray(dst), np.asarray(mask)
-    usable = use & np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    if use.any() and not usable.any():
+    usable = mask & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
+    if mask.any() and not usable.any():
         raise ValueError("no row of src and dst is finite: every match holds NaN or infinity.")
     if usable.any():
-        largest = max(np.abs(a[usable]).max(), np.abs(b[usable]).max())
-        rounding, bound = np.finfo(a.dtype).eps * largest, np.asarray(noise_bound)[usable].min()
+        largest = float(max(np.abs(src[usable]).max(), np.abs(dst[usable]).max()))
+        rounding, bound = float(jnp.finfo(dtype).eps) * largest, float(noise_bound[usable].min())
         if rounding > 0.01 * bound:
             raise ValueError(
-                f"coordinates reach {largest:.3g}, where {a.dtype} resolves {rounding:.2g}: more than 1 % "
+                f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % "
                 f"of noise_bound {bound:.3g}. Subtract a common origin from each cloud first, or use "
                 "register(), which does that in float64."
             )

@@ -145,16 +145,10 @@ class Pose:
         matrix = xp.asarray(matrix)
         if matrix.shape[-2:] != (4, 4):
             raise ValueError(f"a pose matrix has shape (4, 4), received {matrix.shape}")
+        if not isinstance(matrix, jax.core.Tracer):
+            _check_similarity(np.asarray(matrix, np.float64))
         block = matrix[..., :3, :3]
         scale = xp.cbrt(xp.linalg.det(block))
-        if not isinstance(matrix, jax.core.Tracer):
-            square = np.einsum("...ji,...jk->...ik", block, block)
-            error = np.abs(square - np.asarray(scale)[..., None, None] ** 2 * np.eye(3)).max(initial=0)
-            if not (np.all(np.asarray(scale) > 0) and error <= 1e-3 * np.max(np.asarray(scale) ** 2)):
-                raise ValueError(
-                    "the upper left block is not a positive multiple of a rotation matrix: "
-                    "is the matrix transposed, sheared or mirrored?"
-                )
         return cls(block / scale[..., None, None], matrix[..., :3, 3], scale)
 
     @property
@@ -195,6 +189,21 @@ class Pose:
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_matrix(np.asarray(self.rotation))
+
+
+def _check_similarity(matrix: np.ndarray) -> None:
+    """Raise unless each matrix is [s R, t; 0, 1] with s above 0, to one in a thousand."""
+    block = matrix[..., :3, :3]
+    with np.errstate(invalid="ignore"):
+        scale2 = np.cbrt(np.linalg.det(block))[..., None, None] ** 2
+        error = np.abs(np.swapaxes(block, -1, -2) @ block - scale2 * np.eye(3))
+        proper = np.all(error <= 1e-3 * scale2) and np.all(np.linalg.det(block) > 0)
+        bottom = np.allclose(matrix[..., 3, :], [0, 0, 0, 1])
+    if not (proper and bottom and np.all(np.isfinite(matrix))):
+        raise ValueError(
+            "the matrix is not [s R, t; 0, 1] with a positive scale and a rotation: is it transposed, "
+            "sheared or mirrored?"
+        )
 
 
 @partial(

@@ -107,8 +107,9 @@ def fold_pairs(
         padded = jnp.pad(x, [(0, pad)] + [(0, 0)] * (x.ndim - 1))
         return jnp.swapaxes(padded.reshape(w, LANES, *x.shape[1:]), 0, 1)
 
-    columns = (lanes(src), lanes(dst), lanes(noise_bound), lanes(mask), lanes(jnp.arange(n)))
-    rows = jnp.arange(n)[:, None]
+    index = jnp.arange(n, dtype=jnp.int32)
+    columns = (lanes(src), lanes(dst), lanes(noise_bound), lanes(mask), lanes(index))
+    rows = index[:, None]
 
     @jax.checkpoint
     def step(carry: Carry, lane: tuple) -> tuple[Carry, None]:

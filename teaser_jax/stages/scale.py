@@ -114,14 +114,16 @@ def _complete_trims(src: Array, dst: Array, noise_bound: Array, mask: Array) -> 
     wrap = lambda x: jnp.concatenate([x, x[..., :half]], axis=-1)  # noqa: E731
     a2, b2, beta2, mask2 = (wrap(x) for x in (src.T, dst.T, noise_bound, mask))
 
+    index = jnp.arange(n, dtype=jnp.int32)
+
     def row(k: Array) -> tuple[Array, Array, Array]:
         shift = lambda x: lax.dynamic_slice_in_dim(x, k, n, axis=-1)  # noqa: E731
         a, b = shift(a2) - src.T, shift(b2) - dst.T
         values, bounds = trims(a.T, b.T, shift(beta2) + noise_bound)
-        once = (2 * k != n) | (jnp.arange(n) < half)  # half way round, pairs would come twice
+        once = (2 * k != n) | (index < half)  # half way round, pairs would come twice
         return values, bounds, shift(mask2) & mask & once
 
-    rows = lax.map(row, jnp.arange(1, half + 1))
+    rows = lax.map(row, jnp.arange(1, half + 1, dtype=jnp.int32))
     return tuple(x.reshape(-1) for x in rows)
 
 

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 class Vote(NamedTuple):
     """The winning consensus set and its estimate [unit of the measurements]."""
@@ -73,20 +73,22 @@ def vote(
     moments = jnp.stack([weights, weights * offsets, weights * offsets**2, voters.astype(dtype)], axis=1)
     sums = jnp.cumsum(moments[who] * sign[:, None], axis=0)
 
+    # Between two ends the consensus set is constant. Where ends meet within rounding there is no
+    # room to stand in, so such sets count only if no other does.
+    begin = ends[order]
+    until = jnp.concatenate([begin[1:], begin[-1:]])
     size = sums[:, 3]
-    occupied = (size > 0.5) & (sums[:, 0] > 0)
-    means = sums[:, 1] / jnp.where(occupied, sums[:, 0], 1)
-    costs = sums[:, 2] - sums[:, 1] * means - cbar2 * size  # relative to all being outliers
-    allowed = occupied & (means + centre >= interval[0]) & (means + centre <= interval[1])
+    means = sums[:, 1] / jnp.where(sums[:, 0] > 0, sums[:, 0], 1)
+    allowed = (size > 0.5) & (sums[:, 0] > 0)
+    allowed &= (means + centre >= interval[0]) & (means + centre <= interval[1])
+    wide = allowed & (until - begin > 8 * jnp.finfo(dtype).eps * (jnp.abs(begin) + jnp.abs(centre)))
+    allowed = jnp.where(jnp.any(wide), wide, allowed)
+    found = jnp.any(allowed)
     if criterion == "consensus":
         allowed &= size > jnp.max(jnp.where(allowed, size, 0)) - 0.5
-    costs = jnp.where(allowed, costs, jnp.inf)
-
-    best = jnp.argmin(costs)
-    witness = means[best]
-    if criterion == "consensus":  # the largest set need not hold its own mean
-        witness = 0.5 * (ends[order[best]] + ends[order[jnp.minimum(best + 1, 2 * k - 1)]])
-    found = jnp.any(allowed)
+    costs = sums[:, 2] - sums[:, 1] * means - cbar2 * size  # relative to all being outliers
+    best = _first_smallest(jnp.where(allowed, costs, jnp.inf))
+    witness = 0.5 * (begin[best] + until[best])
     members = voters & (jnp.abs(witness - offsets) <= reach) & found
     # Afresh from the members: the running sums carry an error of about 1e-12 of the total cost.
     chosen = jnp.where(members, weights, 0)
@@ -94,6 +96,17 @@ def vote(
     estimate = jnp.sum(chosen * offsets) / jnp.where(mass > 0, mass, 1)
     estimate, witness = (jnp.where(found, x + centre, 0) for x in (estimate, witness))
     return Vote(estimate, witness, members)
+
+
+def _first_smallest(x: Float[Array, " m"]) -> Int[Array, ""]:
+    """``argmin`` from plain reductions.
+
+    Inside a jit, programs are lowered after a caller's x64 block was left. What is lowered by way
+    of other JAX functions (argmin, an iota of 64 bits) then mixes 32 and 64 bits; plain operations
+    on values that are 64 bits wide already do not. Indices are int32 throughout for that reason.
+    """
+    index = jnp.arange(x.shape[0], dtype=jnp.int32)
+    return jnp.min(jnp.where(x == jnp.min(x), index, x.shape[0] - 1))
 
 
 def _argsort(keys: Float[Array, " m"]) -> Array:
@@ -108,5 +121,6 @@ def _argsort(keys: Float[Array, " m"]) -> Array:
     index_bits = max(1, (keys.shape[0] - 1).bit_length())
     raw = lax.bitcast_convert_type(keys, jnp.int64)
     ordered = jnp.where(raw < 0, raw ^ jnp.iinfo(jnp.int64).max, raw)
-    packed = ((ordered >> index_bits) << index_bits) | jnp.arange(keys.shape[0], dtype=jnp.int64)
+    index = jnp.arange(keys.shape[0], dtype=jnp.int32).astype(jnp.int64)
+    packed = ((ordered >> index_bits) << index_bits) | index
     return lax.sort(packed, is_stable=False) & ((1 << index_bits) - 1)

@@ -1,0 +1,43 @@
+"""Fixtures for every test file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import pytest
+
+import teaser_jax as tj
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """JAX in float64 for one test; the default, float32, is what most users have."""
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of real data, which a plain clone does not have."""
+    named = os.environ.get("TEASER_JAX_DATA")
+    if not named:
+        pytest.skip("real data: TEASER_JAX_DATA names no folder")
+    folder = Path(named)
+    if not folder.is_dir():
+        pytest.skip(f"real data: TEASER_JAX_DATA names {named}, which is no folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small() -> tj.synthetic.SyntheticProblem:
+    """A problem of the smallest size there is a program for: 32 matches, half of them wrong."""
+    return tj.synthetic.random_problem(0, n=32, outlier_rate=0.5)
+
+
+@pytest.fixture(scope="session")
+def solved(small: tj.synthetic.SyntheticProblem) -> tj.Registration:
+    """The answer to ``small``."""
+    return tj.register(small.src, small.dst, noise_bound=small.noise_bound)

@@ -1,0 +1,172 @@
+"""Slow and readable answers to hold the fast ones against, and small random problems."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import networkx as nx
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import teaser_jax as tj
+
+# Compiled once for all test files: most of a test's time is XLA's.
+solve = jax.jit(tj.solve)
+
+
+class Matches(NamedTuple):
+    """A random problem and its truth."""
+
+    src: np.ndarray
+    dst: np.ndarray
+    noise_bound: float
+    truth: tj.Pose
+    inliers: np.ndarray
+
+
+def in_ball(rng: np.random.Generator, n: int, radius: float) -> np.ndarray:
+    """Points drawn uniformly from a ball."""
+    direction = rng.normal(size=(n, 3))
+    length = radius * rng.uniform(size=(n, 1)) ** (1 / 3)
+    return length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    return Rotation.from_quat(rng.normal(size=4)).as_matrix()
+
+
+def random_pose(rng: np.random.Generator, scale: float = 1.0) -> tj.Pose:
+    return tj.Pose(random_rotation(rng), rng.uniform(-1, 1, 3), np.float64(scale))
+
+
+def random_matches(
+    seed: int, n: int = 32, *, wrong: float = 0.5, noise_bound: float = 0.05, scale: float = 1.0
+) -> Matches:
+    """Matches in a cube; right ones off by at most the bound, wrong ones anywhere within 5."""
+    rng = np.random.default_rng(seed)
+    src = rng.uniform(-1, 1, (n, 3))
+    truth = random_pose(rng, scale)
+    dst = truth.apply(src) + in_ball(rng, n, noise_bound)
+    lost = rng.permutation(n) < round(wrong * n)
+    dst[lost] = in_ball(rng, int(lost.sum()), 5.0)
+    return Matches(src, dst, noise_bound, truth, ~lost)
+
+
+def problem_of(matches: Matches, **known) -> tj.Problem:
+    return tj.make_problem(matches.src, matches.dst, **{"noise_bound": matches.noise_bound, **known})
+
+
+def pose_error(estimate: tj.Pose, truth: tj.Pose) -> float:
+    """The largest difference of any entry of the two matrices."""
+    return float(np.max(np.abs(np.asarray(estimate.matrix) - np.asarray(truth.matrix))))
+
+
+def joint_residuals(pose: tj.Pose, src, dst, noise_bound) -> np.ndarray:
+    """Distance of each match from the pose, in units of its bound."""
+    pose = jax.tree.map(np.asarray, pose)
+    return np.linalg.norm(dst - pose.apply(src), axis=1) / noise_bound
+
+
+# --- truncated least squares for one number -----------------------------------------------------
+
+
+def consensus_sets(values, bounds, cbar2) -> np.ndarray:
+    """Every consensus set of Theorem 7 as a row: at interval ends, around them and between them."""
+    reach = np.sqrt(cbar2) * bounds
+    ends = np.sort(np.concatenate([values - reach, values + reach]))
+    nearby = [ends, np.nextafter(ends, -np.inf), np.nextafter(ends, np.inf), (ends[1:] + ends[:-1]) / 2]
+    agree = np.abs(np.concatenate(nearby)[:, None] - values) <= reach
+    return np.unique(agree[agree.any(axis=1)], axis=0)
+
+
+def tls_cost(x: float, values, bounds, cbar2) -> float:
+    return float(np.sum(np.minimum((x - values) ** 2 / bounds**2, cbar2)))
+
+
+def mean_of(members, values, bounds) -> float:
+    """The weighted mean (14) of a consensus set."""
+    return float(np.average(values[members], weights=bounds[members] ** -2.0))
+
+
+def set_cost(members, values, bounds, cbar2) -> float:
+    """What a consensus set costs at its mean, all others being outliers."""
+    x = mean_of(members, values, bounds)
+    return float(np.sum((x - values[members]) ** 2 / bounds[members] ** 2) + cbar2 * np.sum(~members))
+
+
+def tls_by_enumeration(values, bounds, cbar2, interval=(-np.inf, np.inf)) -> float:
+    """The least cost of any consensus set whose mean lies in the interval; infinite without one.
+
+    Without an interval that is the global minimum of the truncated cost (Theorem 7).
+    """
+    sets = consensus_sets(values, bounds, cbar2)
+    inside = [s for s in sets if interval[0] <= mean_of(s, values, bounds) <= interval[1]]
+    return min((set_cost(s, values, bounds, cbar2) for s in inside), default=np.inf)
+
+
+def largest_consensus(values, bounds, cbar2, interval=(-np.inf, np.inf)) -> int:
+    """The size of the largest consensus set whose mean lies in the interval."""
+    sets = consensus_sets(values, bounds, cbar2)
+    means = [mean_of(s, values, bounds) for s in sets]
+    sizes = [s.sum() for s, x in zip(sets, means, strict=True) if interval[0] <= x <= interval[1]]
+    return int(max(sizes, default=0))
+
+
+# --- graphs -------------------------------------------------------------------------------------
+
+
+def random_graph(rng: np.random.Generator, n: int, density: float, planted: int = 0) -> np.ndarray:
+    """A symmetric boolean matrix without loops, with a planted clique on random vertices."""
+    upper = np.triu(rng.uniform(size=(n, n)) < density, 1)
+    dense = upper | upper.T
+    inside = rng.permutation(n) < planted
+    dense |= inside[:, None] & inside
+    np.fill_diagonal(dense, False)
+    return dense
+
+
+def pack(dense: np.ndarray) -> np.ndarray:
+    """Boolean rows as 32-bit words: bit t of word j is column 32 j + t."""
+    rows, n = dense.shape
+    packed = np.zeros((rows, -(-n // 32)), np.uint32)
+    for column in range(n):
+        packed[:, column // 32] |= dense[:, column].astype(np.uint32) << np.uint32(column % 32)
+    return packed
+
+
+def unpack(packed, n: int) -> np.ndarray:
+    """The inverse of ``pack``."""
+    columns = np.arange(n)
+    return (np.asarray(packed)[:, columns // 32] >> (columns % 32).astype(np.uint32) & 1).astype(bool)
+
+
+def is_clique(dense: np.ndarray, members) -> bool:
+    inside = dense[np.ix_(members, members)]
+    return bool(np.all(inside | np.eye(len(inside), dtype=bool)))
+
+
+def clique_number(dense: np.ndarray) -> int:
+    """The size of the largest clique, from networkx."""
+    return nx.max_weight_clique(nx.from_numpy_array(dense), weight=None)[1]
+
+
+def edges_in_integers(src: np.ndarray, dst: np.ndarray, tolerance: int) -> np.ndarray:
+    """``| |b_ij| - |a_ij| | <= tolerance`` for integer points, without any rounding.
+
+    With integer squared lengths A and B: (A - B)^2 <= d^2 (2 (A + B) - d^2), or A + B <= d^2.
+    """
+    square = lambda x: np.sum((x[:, None] - x[None]) ** 2, axis=2).astype(object)  # noqa: E731
+    a, b, d2 = square(src), square(dst), tolerance**2
+    edge = ((a - b) ** 2 <= d2 * (2 * (a + b) - d2)) | (a + b <= d2)
+    return edge.astype(bool) & ~np.eye(len(src), dtype=bool)
+
+
+def length_gaps(src, dst, scale: float = 1.0) -> np.ndarray:
+    """``| |b_ij| - s |a_ij| |`` of all pairs in extended precision."""
+
+    def lengths(x: np.ndarray) -> np.ndarray:
+        x = np.asarray(x, np.longdouble)
+        return np.sqrt(np.sum((x[:, None] - x[None]) ** 2, axis=2))
+
+    return np.abs(lengths(dst) - np.longdouble(scale) * lengths(src))

@@ -1,0 +1,250 @@
+"""The command line: what it prints, what it writes, and how it fails."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+import teaser_jax as tj
+from teaser_jax import cli
+
+
+@pytest.fixture
+def matches(tmp_path, small):
+    """The small problem in a file."""
+    path = tmp_path / "matches.npz"
+    np.savez(path, src=small.src, dst=small.dst, T_dst_src=small.truth.matrix)
+    return path
+
+
+@pytest.fixture
+def wrong(tmp_path):
+    """A file in which no match is right."""
+    problem = tj.synthetic.random_problem(0, n=32, outlier_rate=1)
+    path = tmp_path / "wrong.npz"
+    np.savez(path, src=problem.src, dst=problem.dst)
+    return path
+
+
+def strictly(text: str) -> dict:
+    """JSON as every parser understands it."""
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def bad_input(capsys, *arguments) -> str:
+    """The one line that a command ends with."""
+    assert cli.main([str(a) for a in arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.endswith("\n")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("teaser-jax: ")
+    assert "Traceback" not in err
+    return err
+
+
+def test_a_right_answer(matches, tmp_path, small, solved, capsys):
+    output, plot = tmp_path / "T.txt", tmp_path / "p.png"
+    arguments = ["register", matches, "--noise-bound", 0.0554, "-o", output, "--plot", plot]
+    assert cli.main([str(a) for a in arguments]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("ok: OK\n")
+    assert "Error against the T_dst_src of the file" in out
+    assert err == ""
+    np.testing.assert_allclose(np.loadtxt(output), solved.pose.matrix, atol=1e-12)
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+def test_json_holds_the_whole_answer(matches, solved, capsys):
+    assert cli.main(["register", str(matches), "--noise-bound", "0.0554", "--json"]) == 0
+    report = strictly(capsys.readouterr().out)
+    assert report["ok"] is True
+    assert report["status"] == "OK"
+    np.testing.assert_allclose(report["pose"]["T_dst_src"], solved.pose.matrix, atol=1e-12)
+    np.testing.assert_allclose(report["pose"]["quaternion_xyzw"], solved.pose.quat, atol=1e-12)
+    assert report["inliers"] == np.flatnonzero(solved.inliers).tolist()
+    assert report["clique"] == {"size": 16, "upper_bound": 16, "is_maximum": True}
+    assert report["error"]["rotation_deg"] < 3
+
+
+def test_text_and_bounds_from_a_file_give_the_same_answer(tmp_path, small, solved, capsys):
+    table, archive = tmp_path / "m.csv", tmp_path / "m.npz"
+    np.savetxt(table, np.hstack([small.src, small.dst]), delimiter=",", header="x,y,z,u,v,w", comments="")
+    np.savez(archive, src=small.src, dst=small.dst, noise_bound=np.full(32, small.noise_bound))
+    bound = repr(small.noise_bound)
+    for arguments in ([table, "--noise-bound", bound], [archive]):
+        assert cli.main(["register", *map(str, arguments), "--json"]) == 0
+        matrix = strictly(capsys.readouterr().out)["pose"]["T_dst_src"]
+        np.testing.assert_allclose(matrix, solved.pose.matrix, atol=1e-12)
+
+
+def test_an_estimated_scale(tmp_path, capsys):
+    problem = tj.synthetic.random_problem(1, n=32, outlier_rate=0.25, scale=3.0)
+    path = tmp_path / "m.npz"
+    np.savez(path, src=problem.src, dst=problem.dst)
+    assert cli.main(["register", str(path), "--noise-bound", "0.0554", "--scale", "estimate", "--json"]) == 0
+    assert strictly(capsys.readouterr().out)["pose"]["scale"] == pytest.approx(3, rel=0.05)
+
+
+def test_no_trustworthy_answer_leaves_no_pose_behind(wrong, tmp_path, capsys):
+    output, plot = tmp_path / "T.txt", tmp_path / "p.png"
+    output.write_text("the pose of an earlier run")
+    arguments = ["register", wrong, "--noise-bound", 0.0554, "-o", output, "--plot", plot]
+    assert cli.main([str(a) for a in arguments]) == 1
+    out, err = capsys.readouterr()
+    assert out.startswith("NOT OK: ")
+    assert err == f"teaser-jax: {output} not written: {out.split()[2]}\n"
+    assert not output.exists()
+    assert plot.exists()
+    assert cli.main(["register", str(wrong), "--noise-bound", "0.0554", "--json"]) == 1
+    report = strictly(capsys.readouterr().out)
+    assert report["ok"] is False
+    assert report["status"] == out.split()[2]
+
+
+def test_bad_input_leaves_no_pose_behind_either(tmp_path, capsys):
+    output = tmp_path / "T.txt"
+    output.write_text("the pose of an earlier run")
+    bad_input(capsys, "register", tmp_path / "none.npz", "--noise-bound", 1, "-o", output)
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "required: COMMAND"),
+        (["regsiter"], "invalid choice: 'regsiter'"),
+        (["register"], "required: MATCHES"),
+        (["register", "{m}"], "--noise-bound is missing"),
+        (["register", "{m}", "--noise-bound", "much"], "invalid float value: 'much'"),
+        (["register", "{m}", "--noise-bound", "nan"], "noise_bound contains nan"),
+        (["register", "{m}", "--noise-bound", "inf"], "noise_bound contains inf"),
+        (["register", "{m}", "--noise-bound", "-1"], "noise_bound contains -1"),
+        (["register", "{m}", "--noise-bound", "1", "--scale", "big"], "neither a number nor the word estimate"),
+        (["register", "{m}", "--noise-bound", "1", "--scale", "0"], "scale is 0"),
+        (["register", "{m}", "--noise-bound", "1", "--cbar2", "nan"], "cbar2 is nan"),
+        (["register", "{m}", "--noise-bound", "1", "--clique", "big"], "invalid choice: 'big'"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "{d}"], "is a folder: name a file to write"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "{d}/no/T.txt"], "does not exist: make it first"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "{m}"], "is the file of matches"),
+        (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.bmp2"], "end the name in .png"),
+        (["register", "{d}/none.npz", "--noise-bound", "1"], "no such file"),
+        (["demo", "--plot", "{d}/no/demo.png"], "does not exist: make it first"),
+        (["demo", "--seed", "-1"], "-1 is no seed"),
+    ],
+)
+def test_bad_arguments(matches, tmp_path, capsys, arguments, message):
+    filled = [a.format(m=matches, d=tmp_path) for a in arguments]
+    assert message in bad_input(capsys, *filled)
+    assert matches.exists()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (dict(src=np.zeros((5, 3)), dst=np.zeros((4, 3))), "src has 5 rows and dst has 4"),
+        (dict(src=np.zeros((3, 5)), dst=np.zeros((3, 5))), "points are rows"),
+        (dict(src=np.zeros((0, 3)), dst=np.zeros((0, 3))), "empty"),
+        (dict(src=np.array(["a"]), dst=np.array(["b"])), "src"),
+        (dict(src=np.full((5, 3), np.nan), dst=np.zeros((5, 3))), "no row of src and dst is finite"),
+        (dict(src=np.zeros((5, 3)), dst=np.zeros((5, 3)), mask=np.ones(4, bool)), "mask has shape (4,)"),
+    ],
+)
+def test_bad_arrays(tmp_path, capsys, arrays, message):
+    path = tmp_path / "m.npz"
+    np.savez(path, **arrays)
+    assert message in bad_input(capsys, "register", path, "--noise-bound", 1)
+
+
+NUMBERS = hnp.arrays(
+    st.sampled_from([np.float64, np.float32, np.int32, np.uint8, np.bool_, np.complex64]),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5) | st.tuples(st.integers(0, 20), st.just(3)),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(src=NUMBERS, dst=NUMBERS, bound=st.floats(width=32))
+def test_any_arrays_end_in_an_exit_code(tmp_path, capsys, src, dst, bound):
+    path = tmp_path / "any.npz"
+    np.savez(path, src=src, dst=dst)
+    code = cli.main(["register", str(path), "--json", f"--noise-bound={bound}"])
+    out, err = capsys.readouterr()
+    if code == 2:
+        assert out == ""
+        assert len(err.splitlines()) == 1
+    else:
+        assert strictly(out)["ok"] is (code == 0)
+
+
+def test_memory_runs_out(matches, capsys, monkeypatch):
+    def register(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(tj, "register", register)
+    assert "32 matches need more memory" in bad_input(capsys, "register", matches, "--noise-bound", 1)
+
+
+def test_a_bug_is_not_called_bad_input(matches, monkeypatch):
+    def register(*_, **__):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(tj, "register", register)
+    with pytest.raises(RuntimeError, match="a bug"):
+        cli.main(["register", str(matches), "--noise-bound", "1"])
+
+
+def test_demo(tmp_path, small, capsys, monkeypatch):
+    monkeypatch.setattr(tj.synthetic, "random_problem", lambda seed: small)
+    path = tmp_path / "demo.png"
+    assert cli.main(["demo", "--plot", str(path)]) == 0
+    out, err = capsys.readouterr()
+    for part in ("32 matches, 16 of them wrong", "ok: OK", "proved maximum", "refinement", f"Picture: {path}"):
+        assert part in out
+    assert err == ""
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_demo_without_matplotlib_leaves_the_picture_out(tmp_path, small, capsys, monkeypatch):
+    monkeypatch.setattr(tj.synthetic, "random_problem", lambda seed: small)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert cli.main(["demo", "--plot", str(tmp_path / "demo.png")]) == 0
+    assert "teaser-jax[viz]" in capsys.readouterr().err
+
+
+def test_version_and_help(capsys):
+    for arguments, text in ((["--version"], tj.__version__), (["register", "--help"], "--noise-bound")):
+        with pytest.raises(SystemExit, match="0"):
+            cli.main(arguments)
+        assert text in capsys.readouterr().out
+
+
+def test_as_a_program(tmp_path):
+    path = tmp_path / "broken.npz"
+    path.write_bytes(b"PK\x03\x04")
+    command = [sys.executable, "-m", "teaser_jax.cli", "register", str(path), "--noise-bound", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1
+    assert "is no .npz archive" in done.stderr
+
+
+def test_a_real_pair(data_dir, capsys):
+    path = data_dir / "kitti_fpfh" / "080.npz"
+    if not path.exists():
+        pytest.skip("real data: no KITTI pairs there")
+    assert cli.main(["register", str(path), "--noise-bound", "0.6", "--json"]) == 0
+    error = strictly(capsys.readouterr().out)["error"]
+    assert error["rotation_deg"] < 5
+    assert error["translation"] < 0.6

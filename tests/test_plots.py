@@ -1,0 +1,105 @@
+"""Pictures: drawn for every answer, without touching anything global."""
+
+from __future__ import annotations
+
+import io
+import sys
+from dataclasses import replace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import teaser_jax as tj
+from teaser_jax import plots
+from teaser_jax.stages import bits
+
+
+def drawn(figure) -> np.ndarray:
+    """The pixels, which must not be all white."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=40)
+    buffer.seek(0)
+    pixels = mpl.image.imread(buffer, format="png")
+    assert (pixels[..., :3].min(axis=-1) < 0.9).mean() > 0.005
+    return pixels
+
+
+@pytest.fixture(autouse=True)
+def nothing_global_changes():
+    before = dict(mpl.rcParams)
+    yield
+    assert dict(mpl.rcParams) == before
+    assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
+
+
+def test_an_answer(small, solved):
+    figure = plots.plot_registration(small.src, small.dst, solved)
+    before, after = figure.axes
+    assert before.get_title() == "Before: 32 matches"
+    assert after.get_title() == "After: 16 inliers, OK"
+    drawn(figure)
+
+
+def test_a_failed_answer_says_so_in_red(small, solved):
+    failed = replace(solved, status=tj.Status.NO_CONSENSUS, inliers=np.zeros(32, bool))
+    after = plots.plot_registration(small.src, small.dst, failed).axes[1]
+    assert after.get_title() == "After: 0 inliers, NO_CONSENSUS"
+    assert after.title.get_color() == plots.BAD
+
+
+def test_the_picture_does_not_depend_on_where_the_clouds_are(small, solved):
+    # Far from the origin only the digits that float64 has left may differ.
+    origin = np.array([1e6, -2e6, 3e6])
+    pose = solved.pose
+    translation = pose.translation + 2 * origin - pose.scale * pose.rotation @ origin
+    moved = replace(solved, pose=tj.Pose(pose.rotation, translation, pose.scale))
+    near = drawn(plots.plot_registration(small.src, small.dst, solved))
+    far = drawn(plots.plot_registration(small.src + origin, small.dst + 2 * origin, moved))
+    assert np.abs(near - far).mean() < 1e-3
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+def test_hardly_any_finite_rows(small, solved, rows):
+    src = small.src.copy()
+    src[rows:] = np.nan
+    figure = plots.plot_registration(src, small.dst, solved)
+    figure.savefig(io.BytesIO(), format="png", dpi=40)
+
+
+def test_every_stage(small, solved):
+    selection = solved.solution.selection
+    edges = np.array(small.inliers[:, None] & small.inliers & ~np.eye(32, dtype=bool))
+    edges[0, 1] = edges[1, 0] = True
+    edge_bits = np.asarray(bits.pack(edges))
+    r2 = np.random.default_rng(0).chisquare(3, size=32)
+    offsets = small.dst - solved.pose.apply(small.src) + solved.pose.translation
+    for figure in (
+        plots.plot_trims(r2, np.full(32, 0.1), 1.0, truth=1.1),
+        plots.plot_graph(edge_bits, selection.clique),
+        plots.plot_clique(edge_bits, selection.clique),
+        plots.plot_residuals(r2, r2 < 1),
+        plots.plot_translation(offsets, np.full(32, 0.1), selection.translation, solved.pose.translation),
+        plots.plot_refinement(r2, 0.9 * r2),
+    ):
+        drawn(figure)
+
+
+def test_stages_with_nothing_to_show():
+    none = np.zeros(0)
+    figures = (
+        plots.plot_trims(none, none, 1.0),
+        plots.plot_residuals(none, none.astype(bool)),
+        plots.plot_translation(none.reshape(0, 3), none, none.reshape(0, 3).astype(bool), np.zeros(3)),
+        plots.plot_refinement(none, none),
+        plots.plot_graph(np.zeros((4, 1), np.uint32), np.zeros(4, bool)),
+        plots.plot_clique(np.zeros((4, 1), np.uint32), np.zeros(4, bool)),
+    )
+    for figure in figures:
+        figure.savefig(io.BytesIO(), format="png", dpi=40)
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch, small, solved):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match=r"teaser-jax\[viz\]"):
+        plots.plot_registration(small.src, small.dst, solved)

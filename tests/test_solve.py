@@ -1,0 +1,445 @@
+"""The whole method inside jit: one answer however it is run, and laws that any answer obeys."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from oracles import Matches, joint_residuals, pose_error, problem_of, random_matches, random_pose, solve
+
+import teaser_jax as tj
+from teaser_jax.problem import pad_problem
+
+N = 32
+refit = jax.jit(tj.refit)
+solve_batch = jax.jit(jax.vmap(tj.solve))
+both_scales = pytest.mark.parametrize("scale", [1.3, None], ids=["known", "unknown"])
+
+
+def matches_of(seed: int, n: int = N, *, wrong: float = 0.4) -> Matches:
+    return random_matches(seed, n, wrong=wrong, scale=1.3)
+
+
+def item(batch, index: int):
+    return jax.tree.map(lambda x: x[index], batch)
+
+
+def assert_same(a: tj.Solution, b: tj.Solution, *, rows: int | None = None, tolerance: float = 1e-12) -> None:
+    """The same sets, status and bounds; poses to the tolerance."""
+    for x, y in ((a.inliers, b.inliers), (a.selection.clique, b.selection.clique)):
+        np.testing.assert_array_equal(x[:rows], y[:rows])
+    np.testing.assert_array_equal(a.selection.translation[:rows], b.selection.translation[:rows])
+    for name in ("status", "clique_size", "clique_upper_bound", "clique_is_maximum", "excluded"):
+        assert getattr(a, name) == getattr(b, name), name
+    assert pose_error(a.pose, b.pose) <= tolerance
+    np.testing.assert_allclose(a.cost, b.cost, atol=1e-9)
+
+
+def assert_finite(solution) -> None:
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(solution))
+
+
+# --- one answer however it is run -----------------------------------------------------------------
+
+
+@both_scales
+def test_right_matches_are_found(scale, x64):
+    for seed in range(10):
+        matches = matches_of(seed)
+        solution = solve(problem_of(matches, scale=scale))
+        assert bool(solution.ok)
+        assert pose_error(solution.pose, matches.truth) < 0.1
+        assert not np.any(solution.inliers & ~matches.inliers)
+        assert np.mean(np.asarray(solution.inliers)[matches.inliers]) > 0.7
+        agree = joint_residuals(solution.pose, matches.src, matches.dst, matches.noise_bound) <= 1
+        np.testing.assert_array_equal(solution.inliers, agree)
+        assert int(solution.clique_size) >= matches.inliers.sum()
+        assert bool(solution.clique_is_maximum)
+        assert bool(solution.selection.refined)
+
+
+def test_eager_equals_jit(x64):
+    problem = problem_of(matches_of(0), scale=None)
+    assert_same(tj.solve(problem), solve(problem))
+
+
+@both_scales
+def test_a_batch_equals_a_loop_and_padding_changes_nothing(scale, x64):
+    problems = [problem_of(matches_of(seed, n), scale=scale) for seed, n in enumerate((N, 20, N, 20))]
+    batch = solve_batch(tj.stack_problems(problems))
+    for k, problem in enumerate(problems):
+        alone = solve(problem)
+        assert_same(item(batch, k), alone, rows=problem.src.shape[0])
+        assert not np.any(batch.inliers[k, problem.src.shape[0] :])
+        assert_same(solve(pad_problem(problem, N)), alone, rows=problem.src.shape[0])
+
+
+def test_inside_scan(x64):
+    problems = tj.stack_problems([problem_of(matches_of(seed)) for seed in range(4)])
+    along = jax.jit(lambda x: lax.scan(lambda carry, problem: (carry, tj.solve(problem)), 0, x)[1])(problems)
+    for k in range(4):
+        assert_same(item(along, k), solve(item(problems, k)))
+
+
+@both_scales
+def test_the_pose_is_the_read_out_of_the_selection(scale, x64):
+    for settings in (tj.Settings(), tj.Settings(refine=False)):
+        problem = problem_of(matches_of(1), scale=scale, confidence=np.linspace(0.1, 1, N))
+        solution = solve(problem, settings)
+        assert pose_error(refit(problem, solution.selection), solution.pose) <= 1e-12
+
+
+# --- laws -----------------------------------------------------------------------------------------
+
+
+@both_scales
+def test_moving_the_target_moves_the_answer(scale, x64):
+    for seed in range(3):
+        matches, motion = matches_of(seed), random_pose(np.random.default_rng(seed + 50))
+        plain = solve(problem_of(matches, scale=scale))
+        moved = solve(problem_of(matches._replace(dst=motion.apply(matches.dst)), scale=scale))
+        np.testing.assert_array_equal(moved.inliers, plain.inliers)
+        np.testing.assert_array_equal(moved.selection.clique, plain.selection.clique)
+        assert pose_error(moved.pose, motion @ jax.tree.map(np.asarray, plain.pose)) < 1e-11
+
+
+@both_scales
+def test_moving_the_source_moves_the_answer_back(scale, x64):
+    for seed in range(3):
+        matches, motion = matches_of(seed), random_pose(np.random.default_rng(seed + 60))
+        plain = solve(problem_of(matches, scale=scale))
+        moved = solve(problem_of(matches._replace(src=motion.apply(matches.src)), scale=scale))
+        np.testing.assert_array_equal(moved.inliers, plain.inliers)
+        assert pose_error(moved.pose, jax.tree.map(np.asarray, plain.pose) @ motion.inverse()) < 1e-11
+
+
+@both_scales
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_unit_of_length_does_not_matter(scale, unit, x64):
+    matches = matches_of(2)
+    plain = solve(problem_of(matches, scale=scale))
+    larger = Matches(unit * matches.src, unit * matches.dst, unit * matches.noise_bound, None, None)
+    found = solve(problem_of(larger, scale=scale))
+    np.testing.assert_array_equal(found.inliers, plain.inliers)
+    np.testing.assert_allclose(found.pose.rotation, plain.pose.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.pose.translation, unit * plain.pose.translation, rtol=1e-10)
+    np.testing.assert_allclose(found.pose.scale, plain.pose.scale, rtol=1e-12)
+    np.testing.assert_allclose(found.cost, plain.cost, rtol=1e-8)
+
+
+def test_enlarging_the_target_enlarges_the_scale(x64):
+    matches = matches_of(3)
+    plain = solve(problem_of(matches, scale=None))
+    larger = solve(problem_of(matches._replace(dst=7 * matches.dst), scale=None, noise_bound=7 * matches.noise_bound))
+    np.testing.assert_array_equal(larger.inliers, plain.inliers)
+    np.testing.assert_allclose(larger.pose.scale, 7 * plain.pose.scale, rtol=1e-12)
+    known = solve(problem_of(matches._replace(dst=7 * matches.dst), scale=7 * 1.3, noise_bound=7 * matches.noise_bound))
+    assert float(known.pose.scale) == 7 * 1.3
+    np.testing.assert_array_equal(known.inliers, solve(problem_of(matches, scale=1.3)).inliers)
+
+
+@both_scales
+def test_the_order_of_rows_does_not_matter(scale, x64):
+    matches = matches_of(4)
+    plain = solve(problem_of(matches, scale=scale))
+    for seed in range(3):
+        order = np.random.default_rng(seed).permutation(N)
+        mixed = matches._replace(src=matches.src[order], dst=matches.dst[order])
+        found = solve(problem_of(mixed, scale=scale))
+        np.testing.assert_array_equal(found.inliers, plain.inliers[order])
+        np.testing.assert_array_equal(found.selection.clique, plain.selection.clique[order])
+        assert pose_error(found.pose, plain.pose) < 1e-12
+
+
+@both_scales
+def test_masked_rows_do_not_exist(scale, x64):
+    matches, mask = matches_of(5), np.random.default_rng(0).uniform(size=N) < 0.7
+    masked = solve(problem_of(matches, scale=scale, mask=mask))
+    weightless = solve(problem_of(matches, scale=scale, confidence=mask * 1.0))
+    assert_same(weightless, masked, tolerance=0)
+    spoiled = matches._replace(src=np.where(mask[:, None], matches.src, np.nan))
+    assert_same(solve(problem_of(spoiled, scale=scale, mask=mask)), masked, tolerance=0)
+    assert not np.any(masked.inliers & ~mask)
+    first = matches._replace(src=np.concatenate([matches.src[mask], matches.src[~mask]]),
+                             dst=np.concatenate([matches.dst[mask], matches.dst[~mask]]))  # fmt: skip
+    moved = solve(problem_of(first, scale=scale, mask=np.arange(N) < mask.sum()))
+    np.testing.assert_array_equal(moved.inliers[: mask.sum()], masked.inliers[mask])
+
+
+def test_confidence_weighs_the_fit_and_nothing_else(x64):
+    matches, confidence = matches_of(6), np.random.default_rng(1).uniform(0.1, 1, N)
+    plain, weighted = (solve(problem_of(matches, scale=1.3, confidence=c)) for c in (None, confidence))
+    np.testing.assert_array_equal(weighted.selection.clique, plain.selection.clique)
+    assert 1e-6 < pose_error(weighted.pose, plain.pose) < 0.05
+    doubled = solve(problem_of(matches, scale=1.3, confidence=2 * confidence))
+    assert_same(doubled, weighted)
+
+
+@both_scales
+def test_bounds_of_their_own_for_every_match(scale, x64):
+    # Two matches are off by ten times what the others may be, and say so.
+    matches = matches_of(7)
+    bounds, right = np.full(N, matches.noise_bound), np.flatnonzero(matches.inliers)[:2]
+    dst = matches.dst.copy()
+    dst[right] += [[0.3, 0, 0], [0, -0.3, 0]]
+    bounds[right] = 0.5
+    solution = solve(problem_of(matches._replace(dst=dst), scale=scale, noise_bound=bounds))
+    assert bool(solution.ok)
+    assert np.all(np.asarray(solution.inliers)[right])
+    strict = solve(problem_of(matches._replace(dst=dst), scale=scale))
+    assert not np.any(np.asarray(strict.inliers)[right])
+    assert pose_error(solution.pose, matches.truth) < 0.1
+
+
+@both_scales
+def test_truncation_is_in_units_of_the_bounds(scale, x64):
+    matches = matches_of(8)
+    plain = solve(problem_of(matches, scale=scale))
+    halved = solve(problem_of(matches, scale=scale, noise_bound=matches.noise_bound / 2, cbar2=4.0))
+    np.testing.assert_array_equal(halved.inliers, plain.inliers)
+    assert pose_error(halved.pose, plain.pose) < 1e-12
+    np.testing.assert_allclose(halved.cost, 4 * plain.cost, rtol=1e-9)
+    wide = solve(problem_of(matches, scale=scale, cbar2=4.0))
+    assert np.all(np.asarray(wide.inliers)[matches.inliers])
+
+
+@both_scales
+def test_the_refined_cost_is_never_above_that_of_the_cascade(scale, x64):
+    for seed in range(10):
+        problem = problem_of(random_matches(seed, N, wrong=0.4, noise_bound=0.2, scale=1.3), scale=scale)
+        refined, cascade = solve(problem), solve(problem, tj.Settings(refine=False))
+        assert float(refined.cost) <= float(cascade.cost) + 1e-9
+
+
+# --- given pairs ----------------------------------------------------------------------------------
+
+
+@both_scales
+def test_a_chain_of_pairs_on_good_matches_keeps_them_all(scale, x64):
+    matches = random_matches(9, 100, wrong=0, scale=1.3)
+    # A little slack: the fit may otherwise push a match just over its bound.
+    problem = problem_of(
+        matches, scale=scale, noise_bound=1.2 * matches.noise_bound, pairs=[(i, i + 1) for i in range(99)]
+    )
+    solution = solve(problem)
+    assert int(solution.inliers.sum()) == 100
+    assert int(solution.clique_size) == 100
+    assert int(solution.clique_upper_bound) >= 100
+    assert bool(solution.ok)
+    assert pose_error(solution.pose, matches.truth) < 0.05
+
+
+@both_scales
+def test_all_pairs_given_are_the_complete_graph(scale, x64):
+    matches = matches_of(10)
+    plain = solve(problem_of(matches, scale=scale))
+    given = solve(problem_of(matches, scale=scale, pairs=list(combinations(range(N), 2))))
+    np.testing.assert_array_equal(given.inliers, plain.inliers)
+    np.testing.assert_array_equal(given.selection.clique, plain.selection.clique)
+    assert int(given.clique_upper_bound) == int(plain.clique_upper_bound)
+    assert pose_error(given.pose, plain.pose) < 1e-12
+
+
+# --- settings -------------------------------------------------------------------------------------
+
+VARIANTS = {
+    "greedy": tj.Settings(clique="greedy"),
+    "networkx": tj.Settings(clique="networkx"),
+    "complete": tj.Settings(tim_graph="complete"),
+    "consensus": tj.Settings(vote="consensus"),
+    "cascade": tj.Settings(refine=False),
+    "complete cascade": tj.Settings(refine=False, tim_graph="complete"),
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_every_setting_finds_the_right_matches(variant, x64):
+    settings = VARIANTS[variant]
+    for seed in range(3):
+        matches = matches_of(seed)
+        # One program with the scale unknown covers the most; "greedy" and "networkx" start behind it.
+        problem = problem_of(matches, scale=1.3 if "clique" in variant else None)
+        solution = solve(problem, settings)
+        assert bool(solution.ok)
+        assert pose_error(solution.pose, matches.truth) < 0.2
+        assert not np.any(solution.inliers & ~matches.inliers)
+        assert int(solution.clique_upper_bound) >= matches.inliers.sum()
+        assert bool(solution.clique_is_maximum) <= (solution.clique_size == solution.clique_upper_bound)
+        assert bool(solution.selection.refined) == settings.refine
+        assert pose_error(refit(problem, solution.selection), solution.pose) <= 1e-12
+        if not settings.refine:
+            axes = np.asarray(solution.selection.translation)
+            np.testing.assert_array_equal(solution.inliers, axes.all(axis=1) & solution.selection.clique)
+
+
+def test_without_pruning_nothing_is_proved(x64):
+    matches = matches_of(0, wrong=0.1)
+    solution = solve(problem_of(matches, scale=1.3), tj.Settings(clique="none"))
+    assert int(solution.clique_size) == N
+    assert not bool(solution.clique_is_maximum)
+    assert pose_error(solution.pose, matches.truth) < 0.1
+
+
+def test_an_exhausted_budget_is_admitted(x64):
+    # All-to-all matches of few points: many rival cliques, which one node cannot settle.
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (8, 3))
+    i, j = (x.ravel() for x in np.meshgrid(range(8), range(8)))
+    matches = Matches(points[i][:N], points[j][:N], 0.4, None, None)
+    settings = tj.Settings(clique_nodes=1)
+    stopped, finished = solve(problem_of(matches), settings), solve(problem_of(matches))
+    assert bool(finished.clique_is_maximum)
+    assert int(stopped.clique_size) <= int(finished.clique_size) <= int(stopped.clique_upper_bound)
+    assert int(stopped.clique_size) < int(stopped.clique_upper_bound)
+    assert not bool(stopped.clique_is_maximum)
+
+
+# --- dtypes ---------------------------------------------------------------------------------------
+
+
+@both_scales
+def test_float32_stays_float32_and_jax_stays_as_it_was(scale):
+    before = jax.config.jax_enable_x64
+    assert not before
+    for seed in range(3):
+        matches = matches_of(seed)
+        solution = solve(problem_of(matches, scale=scale))
+        assert {x.dtype for x in jax.tree.leaves(solution.pose)} == {jnp.dtype("float32")}
+        assert solution.cost.dtype == jnp.float32
+        assert solution.status.dtype == solution.clique_size.dtype == jnp.int32
+        with jax.enable_x64(True):
+            exact = solve(problem_of(matches, scale=scale))
+            np.testing.assert_array_equal(solution.inliers, exact.inliers)
+            assert pose_error(solution.pose, exact.pose) < 1e-5
+    assert jax.config.jax_enable_x64 == before
+    assert jnp.ones(()).dtype == jnp.float32
+
+
+def test_a_float32_problem_stays_float32_with_x64_on(x64):
+    matches = matches_of(0)
+    narrow = matches._replace(src=matches.src.astype(np.float32), dst=matches.dst.astype(np.float32))
+    problem = problem_of(narrow, scale=None)
+    assert {x.dtype for x in jax.tree.leaves(jax.eval_shape(tj.solve, problem).pose)} == {jnp.dtype("float32")}
+
+
+@pytest.mark.parametrize("wide", [False, True], ids=["x64 off", "x64 on"])
+@pytest.mark.parametrize("variant", ["default", *VARIANTS])
+@both_scales
+def test_no_dtype_is_promoted_by_accident(scale, variant, wide):
+    settings = VARIANTS.get(variant, tj.Settings())
+    with jax.enable_x64(wide), jax.numpy_dtype_promotion("strict"):
+        problem = problem_of(matches_of(0), scale=scale)
+        solution = jax.eval_shape(lambda p: tj.solve(p, settings), problem)
+    expected = jnp.dtype("float64" if wide else "float32")
+    assert {x.dtype for x in jax.tree.leaves(solution.pose)} == {expected}
+    assert {x.dtype for x in jax.tree.leaves(solution)} <= {expected, *map(jnp.dtype, ("bool", "int32", "uint32"))}
+
+
+# --- derivatives ----------------------------------------------------------------------------------
+
+
+def inputs_of(problem: tj.Problem) -> dict:
+    names = ("src", "dst", "noise_bound", "confidence") + (() if problem.scale is None else ("scale",))
+    return {name: getattr(problem, name) for name in names}
+
+
+def entries(problem: tj.Problem, settings: tj.Settings, inputs: dict):
+    return tj.solve(replace(problem, **inputs), settings).pose.matrix
+
+
+@jax.jit
+def derivatives(problem, settings, direction, cotangent):
+    """The derivative along a direction, forward; and the gradient of a combination, reverse."""
+    run = lambda inputs: entries(problem, settings, inputs)  # noqa: E731
+    _, forward = jax.jvp(run, (inputs_of(problem),), (direction,))
+    _, pull = jax.vjp(run, inputs_of(problem))
+    return forward, pull(cotangent)[0]
+
+
+GRADIENT_CASES = {
+    "known": (1.3, tj.Settings()),
+    "unknown": (None, tj.Settings()),
+    "cascade, complete": (None, tj.Settings(refine=False, tim_graph="complete")),
+    "cascade, chain": (1.3, tj.Settings(refine=False)),
+}
+
+
+@pytest.mark.parametrize("case", GRADIENT_CASES)
+def test_forward_reverse_and_central_differences_agree(case, x64):
+    scale, settings = GRADIENT_CASES[case]
+    rng = np.random.default_rng(0)
+    problem = problem_of(matches_of(11), scale=scale, confidence=rng.uniform(0.5, 1, N))
+    plain, cotangent = solve(problem, settings), rng.normal(size=(4, 4))
+    for name, value in inputs_of(problem).items():
+        direction = {k: np.zeros(np.shape(x)) for k, x in inputs_of(problem).items()}
+        direction[name] = rng.normal(size=np.shape(value)) * (0.1 if name == "noise_bound" else 1)
+        forward, gradient = derivatives(problem, settings, direction, cotangent)
+        ahead, behind = (
+            solve(replace(problem, **{name: value + sign * 1e-6 * direction[name]}), settings) for sign in (1, -1)
+        )
+        for moved in (ahead, behind):
+            np.testing.assert_array_equal(moved.inliers, plain.inliers)
+        central = (ahead.pose.matrix - behind.pose.matrix) / 2e-6
+        np.testing.assert_allclose(forward, central, atol=1e-6, err_msg=name)
+        assert np.sum(gradient[name] * direction[name]) == pytest.approx(np.sum(cotangent * forward), abs=1e-9)
+        assert np.any(np.abs(forward) > 1e-6)
+
+
+def test_dead_rows_have_no_gradient_and_spoil_none(x64):
+    settings, cotangent = tj.Settings(), np.random.default_rng(1).normal(size=(4, 4))
+    problem = problem_of(matches_of(12), scale=1.3)
+    nothing = {k: np.zeros(np.shape(x)) for k, x in inputs_of(problem).items()}
+    dead = np.arange(N) < 6
+    clean = replace(problem, mask=problem.mask & ~dead)
+    spoiled = replace(
+        problem,
+        src=problem.src.at[0].set(jnp.nan).at[1, 2].set(jnp.inf),
+        dst=problem.dst.at[2].set(jnp.nan),
+        noise_bound=problem.noise_bound.at[3].set(jnp.nan).at[4].set(0.0),
+        confidence=problem.confidence.at[5].set(jnp.nan),
+    )
+    _, expected = derivatives(clean, settings, nothing, cotangent)
+    _, found = derivatives(spoiled, settings, nothing, cotangent)
+    for name in ("src", "dst", "noise_bound", "confidence"):
+        assert np.all(np.isfinite(found[name])), name
+        np.testing.assert_array_equal(np.asarray(found[name])[dead], 0)
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-12)
+    assert int(solve(spoiled).excluded) == 5
+    assert_finite(solve(spoiled))
+
+
+def test_a_hopeless_item_leaves_its_neighbours_untouched(x64):
+    good = problem_of(matches_of(13), scale=1.3)
+    lost = problem_of(matches_of(14, wrong=1.0), scale=1.3)
+    poisoned = [
+        replace(good, src=jnp.full((N, 3), jnp.nan)),
+        replace(good, mask=jnp.zeros(N, bool)),
+        lost,
+    ]
+    gradient = jax.jit(jax.vmap(jax.grad(lambda src, p: jnp.sum(tj.solve(replace(p, src=src)).pose.matrix))))
+    answers, slopes = [], []
+    for others in ([good, good, good], poisoned):
+        batch = tj.stack_problems([good, *others])
+        answers.append(solve_batch(batch))
+        slopes.append(gradient(batch.src, batch))
+        assert_finite(answers[-1])
+        assert np.all(np.isfinite(slopes[-1]))
+    jax.tree.map(np.testing.assert_array_equal, item(answers[1], 0), item(answers[0], 0))
+    np.testing.assert_array_equal(slopes[1][0], slopes[0][0])
+    assert not np.any(answers[1].ok[1:])
+    expected = [tj.Status.TOO_FEW_POINTS, tj.Status.TOO_FEW_POINTS, tj.Status.NO_CONSENSUS]
+    np.testing.assert_array_equal(answers[1].status[1:], expected)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_the_smallest_problems_end_finite(n, x64):
+    problem = problem_of(matches_of(15, n, wrong=0), scale=1.3)
+    # Padded, so that the program is one that stands already.
+    solution = solve(pad_problem(problem, N))
+    assert_finite(solution)
+    assert (int(solution.status) == tj.Status.TOO_FEW_POINTS) == (n < 3)
