@@ -39,9 +39,9 @@ def least_squares(case: Case) -> tj.Pose:
 def ours(**settings: object) -> Solver:
     """``register`` with some settings."""
     chosen = tj.Settings(**settings)
-    return lambda case: tj.register(
-        case.src, case.dst, noise_bound=case.noise_bound, scale=case.scale, settings=chosen
-    ).pose
+    return lambda case: (
+        tj.register(case.src, case.dst, noise_bound=case.noise_bound, scale=case.scale, settings=chosen).pose
+    )
 
 
 def run(quick: bool) -> list[dict]:

@@ -86,7 +86,15 @@ def real_pairs() -> Iterator[Case]:
             z = np.load(path)
             truth = Pose.from_matrix(z["T_dst_src"])
             yield Case(
-                f"real, {folder}/{path.stem}", z["src"], z["dst"], bound, 1.0, truth, None, rotation, translation
+                f"real, {folder}/{path.stem}",
+                z["src"],
+                z["dst"],
+                bound,
+                1.0,
+                truth,
+                None,
+                rotation,
+                translation,
             )
 
 

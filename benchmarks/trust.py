@@ -10,7 +10,12 @@ from scipy.stats import binomtest
 
 import teaser_jax as tj
 from benchmarks.problems import (
-    Case, all_wrong, mismatched_real_pairs, protocol, real_pairs, without_correspondences,
+    Case,
+    all_wrong,
+    mismatched_real_pairs,
+    protocol,
+    real_pairs,
+    without_correspondences,
 )  # fmt: skip
 
 # Dense graphs of wrong matches would use any budget, and the answer is wrong whatever it is.
@@ -29,7 +34,9 @@ def cases(quick: bool) -> Iterator[Case]:
         *(protocol(5000, r, 10 // k) for r in (0.95, 0.99)),
         *(without_correspondences(o, 24 // k) for o in (1.0, 0.8, 0.6, 0.4, 0.2)),
     ]
-    wrong = all_wrong({30: 300 // k, 100: 300 // k, 300: 210 // k, 1000: 120 // k, 3000: 45 // k, 5000: 30 // k})
+    wrong = all_wrong(
+        {30: 300 // k, 100: 300 // k, 300: 210 // k, 1000: 120 // k, 3000: 45 // k, 5000: 30 // k}
+    )
     return chain(*right, wrong, real_pairs(), mismatched_real_pairs())
 
 

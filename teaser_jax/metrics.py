@@ -31,5 +31,5 @@ def precision_recall(found: Any, right: Any) -> tuple[float, float]:
     """Share of found inliers that are right, and of right ones that are found; NaN of nothing."""
     found, right = np.asarray(found, bool), np.asarray(right, bool)
     both = float(np.sum(found & right))
-    share = lambda total: both / total if total else float("nan")  # noqa: E731
+    share = lambda total: both / total if total else float("nan")
     return share(found.sum()), share(right.sum())

@@ -88,11 +88,10 @@ def stack_problems(problems: Sequence[Problem]) -> Problem:
         raise ValueError("stack_problems received no problem.")
     for name in ("scale", "pairs"):
         if len({getattr(p, name) is None for p in problems}) > 1:
-            raise ValueError(
-                f"some problems have {name}=None and some do not: stack each kind by itself."
-            )
+            raise ValueError(f"some problems have {name}=None and some do not: stack each kind by itself.")
     n = max(p.src.shape[0] for p in problems)
-    m = None if problems[0].pairs is None else max(p.pairs.shape[0] for p in problems)
+    sizes = [p.pairs.shape[0] for p in problems if p.pairs is not None]
+    m = max(sizes, default=None)
     return jax.tree.map(lambda *x: jnp.stack(x), *[pad_problem(p, n, m) for p in problems])
 
 
@@ -195,7 +194,8 @@ def _mask(value: Any, n: int) -> Any:
     array = _read(value, "mask")
     if array.shape != (n,) or array.dtype.kind != "b":
         raise ValueError(
-            f"mask has shape {array.shape} and dtype {array.dtype}: expected ({n},) truth values, one a match."
+            f"mask has shape {array.shape} and dtype {array.dtype}: expected ({n},) truth values, "
+            "one a match."
         )
     return array
 
@@ -215,7 +215,7 @@ def _pairs(value: Any, n: int) -> Any:
     if not is_traced(array) and array.size:
         low, high = int(np.min(array)), int(np.max(array))
         if low < 0 or high >= n:
-            raise ValueError(f"pairs refer to rows {low} to {high}, but rows run from 0 to {n - 1}.")
+            raise ValueError(f"pairs refer to rows {low} to {high}: rows run from 0 to {n - 1}.")
     return array
 
 

@@ -11,10 +11,22 @@ import jax
 import numpy as np
 
 from teaser_jax.register import (
-    Registration, after_clique, between, centre, device_clique, host_problem, registration_of, to_bucket,
+    Registration,
+    after_clique,
+    between,
+    centre,
+    device_clique,
+    host_problem,
+    registration_of,
+    to_bucket,
 )  # fmt: skip
 from teaser_jax.solve import (
-    Graph, find_edges, find_inliers, find_rotation, find_scale, find_translation,
+    Graph,
+    find_edges,
+    find_inliers,
+    find_rotation,
+    find_scale,
+    find_translation,
 )  # fmt: skip
 from teaser_jax.types import Settings
 
@@ -38,12 +50,14 @@ class Profile:
             f"  {name:<24}{1e3 * self.cold[name]:>9.2f} ms{1e3 * seconds:>9.2f} ms"
             for name, seconds in self.warm.items()
         ]
-        total = f"  {'total':<24}{1e3 * sum(self.cold.values()):>9.2f} ms{1e3 * sum(self.warm.values()):>9.2f} ms"
+        total = (
+            f"  {'total':<24}{1e3 * sum(self.cold.values()):>9.2f} ms{1e3 * sum(self.warm.values()):>9.2f} ms"
+        )
         return "\n".join([*rows, total])
 
 
 def profile(
-    src: Any, dst: Any, *, settings: Settings = Settings(), repeats: int = 5, **known: Any  # noqa: B008
+    src: Any, dst: Any, *, settings: Settings = Settings(), repeats: int = 5, **known: Any
 ) -> Profile:
     """Run ``register`` stage by stage and time each, apart from and after compilation.
 
@@ -87,6 +101,5 @@ def profile(
 
 
 _find_scale, _find_edges, _find_rotation, _find_translation, _find_inliers, _device_clique = (
-    jax.jit(f)
-    for f in (find_scale, find_edges, find_rotation, find_translation, find_inliers, device_clique)
+    jax.jit(f) for f in (find_scale, find_edges, find_rotation, find_translation, find_inliers, device_clique)
 )

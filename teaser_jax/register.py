@@ -13,7 +13,7 @@ from teaser_jax.problem import as_numpy, is_traced, make_problem, pad_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
 from teaser_jax.stages.clique import Clique, maximum_clique, search_on_host
 from teaser_jax.stages.invariants import words
-from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
+from teaser_jax.types import CliqueMethod, Pose, Problem, Selection, Settings, Solution, Status
 
 SMALLEST_BUCKET = 32
 
@@ -53,7 +53,7 @@ def register(
     mask: Any = None,
     confidence: Any = None,
     pairs: Any = None,
-    settings: Settings = Settings(),  # noqa: B008
+    settings: Settings = Settings(),
 ) -> Registration:
     """Register matched points, most of which may be wrong: ``dst_i ~ s R src_i + t``.
 
@@ -139,7 +139,7 @@ def before_clique(problem: Problem, settings: Settings) -> tuple[Graph, Clique]:
 
 def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:
     """The clique as far as the device takes it: the greedy one with its bound."""
-    method = "none" if settings.clique == "none" else "greedy"
+    method: CliqueMethod = "none" if settings.clique == "none" else "greedy"
     return maximum_clique(graph.edge_bits, usable_rows(problem)[0].mask, method=method)
 
 
@@ -207,7 +207,9 @@ def summary(result: Registration) -> str:
         f"  clique       {int(s.clique_size)} matches agree pairwise, {proof}",
         f"  scale        {float(result.pose.scale):.6g}",
         f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) "
-        + "(" + ", ".join(f"{q:.6f}" for q in result.pose.quat) + ")",
+        + "("
+        + ", ".join(f"{q:.6f}" for q in result.pose.quat)
+        + ")",
         f"  translation  ({x:.6g}, {y:.6g}, {z:.6g})",
         f"  cost (6)     {float(s.cost):.6g}",
         f"  {result.status.advice}",

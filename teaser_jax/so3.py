@@ -7,12 +7,15 @@ scalar **last**, ``(x, y, z, w)``, as in the paper.
 from __future__ import annotations
 
 from types import ModuleType
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+
+AnyArray: TypeAlias = Any  # numpy's on the host, JAX's on the device: what lives on both sides
 
 # One-sided Jacobi converges quadratically: over a million random, thin, rank-one and repeated
 # spectra in float64, five sweeps reached rounding; six leave one in reserve.
@@ -27,7 +30,9 @@ def namespace(*arrays: object) -> ModuleType:
     return jnp if any(isinstance(a, jax.Array) for a in arrays) else np
 
 
-def rotate(rotation: Float[Array, "... 3 3"], points: Float[Array, "... n 3"]) -> Float[Array, "... n 3"]:
+def rotate(
+    rotation: Float[AnyArray, "... 3 3"], points: Float[AnyArray, "... n 3"]
+) -> Float[AnyArray, "... n 3"]:
     """Rows of ``points`` turned by ``rotation``; full precision on every backend.
 
     Gradients: exact in both arguments.
@@ -47,9 +52,7 @@ def hat(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 def _axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """``vee(G - G^T)``: twice the axis vector of the skew part."""
-    return jnp.stack(
-        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
-    )
+    return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
 
 
 def _unit(vector: Float[Array, "3"], fallback: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -170,7 +173,7 @@ def _nearest_rotation_jvp(primals: tuple, tangents: tuple) -> tuple:
     return rotation, jnp.einsum("ij,jk->ik", rotation, hat(omega), precision=high)
 
 
-def rotation_angle(rotation: Float[Array, "... 3 3"]) -> Float[Array, "..."]:
+def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "..."]:
     """Angle of a rotation in [0, pi] [rad], accurate near 0 and near pi.
 
     Gradients: use only away from 0 and pi, where the angle has kinks.
@@ -188,7 +191,7 @@ def rotation_angle(rotation: Float[Array, "... 3 3"]) -> Float[Array, "..."]:
     return xp.arctan2(xp.sqrt(xp.sum(skew * skew, axis=-1)), trace - 1)
 
 
-def quat_from_rotation(rotation: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
+def quat_from_rotation(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "... 4"]:
     """Unit quaternion (x, y, z, w), w >= 0, of a rotation matrix.
 
     The four classic branches are all evaluated and the best conditioned one is taken, so the
@@ -214,7 +217,7 @@ def quat_from_rotation(rotation: Float[Array, "... 3 3"]) -> Float[Array, "... 4
     return xp.where(quat[..., 3:] < 0, -quat, quat)
 
 
-def rotation_from_quat(quat: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
+def rotation_from_quat(quat: Float[AnyArray, "... 4"]) -> Float[AnyArray, "... 3 3"]:
     """Rotation matrix of a quaternion (x, y, z, w), which need not have unit length."""
     xp = namespace(quat)
     x, y, z, w = (quat[..., k] / xp.sqrt(xp.sum(quat * quat, axis=-1)) for k in range(4))

@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
@@ -24,7 +23,14 @@ from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.invariants import tim_bounds, tims
 from teaser_jax.stages.refinement import fit_similarity, refine, squared_residuals, truncated_cost
 from teaser_jax.stages.rotation import (
-    Rotation, Tims, complete_tims, correlation, correlation_of_pairs, estimate_rotation, listed_tims, ring_tims,
+    Rotation,
+    Tims,
+    complete_tims,
+    correlation,
+    correlation_of_pairs,
+    estimate_rotation,
+    listed_tims,
+    ring_tims,
 )  # fmt: skip
 from teaser_jax.stages.scale import ScalePairs, estimate_scale, scale_of_pairs, usable_pairs
 from teaser_jax.stages.translation import estimate_translation, translation_of_points
@@ -40,7 +46,7 @@ class Graph(NamedTuple):
     edge_bits: UInt32[Array, "n w"]
 
 
-def solve(problem: Problem, settings: Settings = Settings()) -> Solution:  # noqa: B008
+def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
     """Robust registration of matched points: TEASER++, then a joint refinement.
 
     A pure function: works under jit, vmap, grad and lax.scan, on one device (the exact clique
@@ -72,14 +78,14 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:  # noq
     return conclude(problem, graph, clique, settings)
 
 
-def prepare(problem: Problem, settings: Settings = Settings()) -> Graph:  # noqa: B008
+def prepare(problem: Problem, settings: Settings = Settings()) -> Graph:
     """The scale and the consistency graph."""
     scale, scale_pairs = find_scale(problem, settings)
     return Graph(scale, scale_pairs, find_edges(problem, scale))
 
 
 def find_scale(
-    problem: Problem, settings: Settings = Settings()  # noqa: B008
+    problem: Problem, settings: Settings = Settings()
 ) -> tuple[Float[Array, ""], ScalePairs | None]:
     """The known scale, or the vote (11) and the pairs that agree with it."""
     p, _ = usable_rows(problem)
@@ -94,12 +100,10 @@ def find_scale(
 def find_edges(problem: Problem, scale: Float[Array, ""]) -> UInt32[Array, "n w"]:
     """The consistency graph at a scale."""
     p, _ = usable_rows(problem)
-    return consistency_graph(
-        p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs
-    )
+    return consistency_graph(p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs)
 
 
-def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()) -> Solution:  # noqa: B008
+def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()) -> Solution:
     """Everything behind the clique: the sets, the pose, and whether to trust it."""
     graph, clique = lax.stop_gradient((graph, clique))
     selection, converged = select(lax.stop_gradient(problem), graph, clique, settings)
@@ -125,7 +129,7 @@ def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings 
 
 
 def select(
-    problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()  # noqa: B008
+    problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()
 ) -> tuple[Selection, Bool[Array, ""]]:
     """Which measurements to trust, given the clique, and whether every iteration settled.
 
@@ -208,12 +212,13 @@ def _refit(problem: Problem, selection: Selection, *, refined: bool) -> Pose:
     if refined:
         weights = jnp.where(selection.inliers, p.confidence / p.noise_bound**2, 0)
         return fit_similarity(p.src, p.dst, weights, p.scale).pose
-    scale = p.scale
-    if scale is None:
-        voted = scale_of_pairs(
-            p.src, p.dst, p.noise_bound, p.confidence, selection.scale_pairs, pairs=p.pairs
+    if p.scale is not None:
+        scale = p.scale
+    else:
+        assert selection.scale_pairs is not None, "the selection was made with a known scale"
+        scale = _positive(
+            scale_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, selection.scale_pairs, pairs=p.pairs)
         )
-        scale = _positive(voted)
     rotation = _rotation_of(p, selection.clique, selection.rotation)
     offsets = p.dst - scale * so3.rotate(rotation, p.src)
     translation = translation_of_points(offsets, p.noise_bound, p.confidence, selection.translation)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
+from teaser_jax.so3 import AnyArray
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -82,6 +83,12 @@ class Problem:
     pairs: Int[Array, "m 2"] | None = None
 
 
+CliqueMethod = Literal["exact", "greedy", "networkx", "none"]
+RotationMethod = Literal["gnc"]
+TimGraph = Literal["chain", "complete"]
+Criterion = Literal["tls", "consensus"]
+
+
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=["gnc_factor", "gnc_tolerance", "scale_range"],
@@ -110,10 +117,10 @@ class Settings:
         scale_range: Search interval of an unknown scale [-].
     """
 
-    clique: Literal["exact", "greedy", "networkx", "none"] = "exact"
-    rotation: Literal["gnc"] = "gnc"
-    tim_graph: Literal["chain", "complete"] = "chain"
-    vote: Literal["tls", "consensus"] = "tls"
+    clique: CliqueMethod = "exact"
+    rotation: RotationMethod = "gnc"
+    tim_graph: TimGraph = "chain"
+    vote: Criterion = "tls"
     refine: bool = True
     gnc_iterations: int = 100
     refine_iterations: int = 50
@@ -123,10 +130,27 @@ class Settings:
     gnc_tolerance: float | Float[Array, ""] = 1e-6
     scale_range: tuple[Any, Any] = field(default=(0.0, float("inf")))
 
+    def __post_init__(self) -> None:
+        # JAX rebuilds records with placeholders for numbers; choices and caps are always themselves.
+        for name, kind in _CHOICES.items():
+            if getattr(self, name) not in get_args(kind):
+                allowed = ", ".join(repr(x) for x in get_args(kind))
+                raise ValueError(f"Settings.{name} is {getattr(self, name)!r}: expected one of {allowed}.")
+        for name in ("gnc_iterations", "refine_iterations", "clique_nodes"):
+            if not (isinstance(getattr(self, name), int) and getattr(self, name) > 0):
+                raise ValueError(
+                    f"Settings.{name} is {getattr(self, name)!r}: expected a whole number above 0."
+                )
+        if not self.clique_seconds >= 0:
+            raise ValueError(
+                f"Settings.clique_seconds is {self.clique_seconds!r}: expected 0 or more seconds."
+            )
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=["rotation", "translation", "scale"], meta_fields=[]
-)
+
+_CHOICES = {"clique": CliqueMethod, "rotation": RotationMethod, "tim_graph": TimGraph, "vote": Criterion}
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["rotation", "translation", "scale"], meta_fields=[])
 @dataclass(frozen=True)
 class Pose:
     """The similarity ``b = s R a + t`` from the source to the target frame, ``T_dst_src``.
@@ -134,9 +158,9 @@ class Pose:
     Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind.
     """
 
-    rotation: Float[Array, "*batch 3 3"]
-    translation: Float[Array, "*batch 3"]
-    scale: Float[Array, "*batch"]
+    rotation: Float[AnyArray, "*batch 3 3"]
+    translation: Float[AnyArray, "*batch 3"]
+    scale: Float[AnyArray, "*batch"]
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Pose:
@@ -152,7 +176,7 @@ class Pose:
         return cls(block / scale[..., None, None], matrix[..., :3, 3], scale)
 
     @property
-    def matrix(self) -> Float[Array, "*batch 4 4"]:
+    def matrix(self) -> Float[AnyArray, "*batch 4 4"]:
         """``T_dst_src = [s R, t; 0, 1]``."""
         xp = so3.namespace(self.rotation, self.translation, self.scale)
         scaled = self.scale[..., None, None] * self.rotation
@@ -161,11 +185,11 @@ class Pose:
         return xp.concatenate([top, bottom], axis=-2)
 
     @property
-    def quat(self) -> Float[Array, "*batch 4"]:
+    def quat(self) -> Float[AnyArray, "*batch 4"]:
         """Unit quaternion of the rotation, scalar last."""
         return so3.quat_from_rotation(self.rotation)
 
-    def apply(self, points: Float[Array, "*batch n 3"]) -> Float[Array, "*batch n 3"]:
+    def apply(self, points: Float[AnyArray, "*batch n 3"]) -> Float[AnyArray, "*batch n 3"]:
         """Source points (rows) in the target frame."""
         rotated = so3.rotate(self.rotation, points)
         return self.scale[..., None, None] * rotated + self.translation[..., None, :]
@@ -226,12 +250,12 @@ class Selection:
         refined: Whether the pose is the joint fit to ``inliers``.
     """
 
-    scale_pairs: UInt32[Array, "n w"] | Bool[Array, " m"] | None
-    clique: Bool[Array, " n"]
-    rotation: Bool[Array, " k"] | UInt32[Array, "n w"]
-    translation: Bool[Array, "n 3"]
-    inliers: Bool[Array, " n"]
-    refined: Bool[Array, ""]
+    scale_pairs: UInt32[AnyArray, "n w"] | Bool[AnyArray, " m"] | None
+    clique: Bool[AnyArray, " n"]
+    rotation: Bool[AnyArray, " k"] | UInt32[AnyArray, "n w"]
+    translation: Bool[AnyArray, "n 3"]
+    inliers: Bool[AnyArray, " n"]
+    refined: Bool[AnyArray, ""]
 
 
 @partial(
@@ -260,15 +284,15 @@ class Solution:
 
     pose: Pose
     selection: Selection
-    inliers: Bool[Array, " n"]
-    status: Int[Array, ""]
-    clique_size: Int[Array, ""]
-    clique_upper_bound: Int[Array, ""]
-    clique_is_maximum: Bool[Array, ""]
-    excluded: Int[Array, ""]
-    cost: Float[Array, ""]
+    inliers: Bool[AnyArray, " n"]
+    status: Int[AnyArray, ""]
+    clique_size: Int[AnyArray, ""]
+    clique_upper_bound: Int[AnyArray, ""]
+    clique_is_maximum: Bool[AnyArray, ""]
+    excluded: Int[AnyArray, ""]
+    cost: Float[AnyArray, ""]
 
     @property
-    def ok(self) -> Bool[Array, ""]:
+    def ok(self) -> Bool[AnyArray, ""]:
         """Whether the pose can be trusted. A proof elsewhere never turns this true."""
         return self.status == Status.OK

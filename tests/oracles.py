@@ -12,7 +12,12 @@ from scipy.spatial.transform import Rotation
 import teaser_jax as tj
 
 # Compiled once for all test files: most of a test's time is XLA's.
-solve = jax.jit(tj.solve)
+_solve = jax.jit(tj.solve)
+
+
+def solve(*args) -> tj.Solution:
+    """``tj.solve`` under jit, its answer as numpy."""
+    return jax.device_get(_solve(*args))
 
 
 class Matches(NamedTuple):
@@ -41,13 +46,19 @@ def random_pose(rng: np.random.Generator, scale: float = 1.0) -> tj.Pose:
 
 
 def random_matches(
-    seed: int, n: int = 32, *, wrong: float = 0.5, noise_bound: float = 0.05, scale: float = 1.0
+    seed: int,
+    n: int = 32,
+    *,
+    wrong: float = 0.5,
+    noise_bound: float = 0.05,
+    noise: float = 1.0,
+    scale: float = 1.0,
 ) -> Matches:
-    """Matches in a cube; right ones off by at most the bound, wrong ones anywhere within 5."""
+    """Matches in a cube; right ones off by up to ``noise`` times the bound, wrong ones anywhere within 5."""
     rng = np.random.default_rng(seed)
     src = rng.uniform(-1, 1, (n, 3))
     truth = random_pose(rng, scale)
-    dst = truth.apply(src) + in_ball(rng, n, noise_bound)
+    dst = truth.apply(src) + in_ball(rng, n, noise * noise_bound)
     lost = rng.permutation(n) < round(wrong * n)
     dst[lost] = in_ball(rng, int(lost.sum()), 5.0)
     return Matches(src, dst, noise_bound, truth, ~lost)
@@ -156,7 +167,7 @@ def edges_in_integers(src: np.ndarray, dst: np.ndarray, tolerance: int) -> np.nd
 
     With integer squared lengths A and B: (A - B)^2 <= d^2 (2 (A + B) - d^2), or A + B <= d^2.
     """
-    square = lambda x: np.sum((x[:, None] - x[None]) ** 2, axis=2).astype(object)  # noqa: E731
+    square = lambda x: np.sum((x[:, None] - x[None]) ** 2, axis=2).astype(object)
     a, b, d2 = square(src), square(dst), tolerance**2
     edge = ((a - b) ** 2 <= d2 * (2 * (a + b) - d2)) | (a + b <= d2)
     return edge.astype(bool) & ~np.eye(len(src), dtype=bool)

@@ -7,7 +7,7 @@ the rest go to the exact search on the host.
 from __future__ import annotations
 
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int, UInt32
 
+from teaser_jax.so3 import AnyArray
 from teaser_jax.stages import bits
+from teaser_jax.types import CliqueMethod
 
 SEEDS = 8
 
@@ -23,8 +25,8 @@ SEEDS = 8
 class Clique(NamedTuple):
     """Members of a clique, and a proved bound on the size of every clique."""
 
-    members: Bool[Array, " n"]
-    upper_bound: Int[Array, ""]
+    members: Bool[AnyArray, " n"]
+    upper_bound: Int[AnyArray, ""]
 
 
 def greedy_clique(edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> Clique:
@@ -93,7 +95,7 @@ def maximum_clique(
     edge_bits: UInt32[Array, "n w"],
     mask: Bool[Array, " n"],
     *,
-    method: Literal["exact", "greedy", "networkx", "none"] = "exact",
+    method: CliqueMethod = "exact",
     nodes: int = 100_000_000,
     seconds: float = 60.0,
 ) -> Clique:
@@ -110,14 +112,10 @@ def maximum_clique(
     if method == "greedy":
         return found
     search = partial(_search_batch, method=method, nodes=nodes, seconds=seconds)
-    shapes = Clique(
-        jax.ShapeDtypeStruct(mask.shape, jnp.bool_), jax.ShapeDtypeStruct((), jnp.int32)
-    )
+    shapes = Clique(jax.ShapeDtypeStruct(mask.shape, jnp.bool_), jax.ShapeDtypeStruct((), jnp.int32))
 
     def ask_host() -> Clique:
-        return jax.pure_callback(
-            search, shapes, edge_bits, mask, *found, vmap_method="broadcast_all"
-        )
+        return jax.pure_callback(search, shapes, edge_bits, mask, *found, vmap_method="broadcast_all")
 
     if method == "networkx":
         return ask_host()
@@ -142,13 +140,11 @@ def search_on_host(
         return Clique(members, np.int32(upper))
     from teaser_jax.stages import clique_search
 
-    members, upper = clique_search.search(
-        np.asarray(edge_bits), members, upper, nodes=nodes, seconds=seconds
-    )
+    members, upper = clique_search.search(np.asarray(edge_bits), members, upper, nodes=nodes, seconds=seconds)
     return Clique(members, np.int32(upper))
 
 
-def _search_batch(edge_bits, mask, members, upper, *, method, nodes, seconds):  # noqa: ANN001, ANN202
+def _search_batch(edge_bits, mask, members, upper, *, method, nodes, seconds):
     edge_bits, mask, members, upper = (np.asarray(x) for x in (edge_bits, mask, members, upper))
     out = Clique(np.array(members), np.array(upper, dtype=np.int32))
     for item in np.ndindex(upper.shape):
@@ -174,7 +170,7 @@ def _with_networkx(edge_bits: np.ndarray, mask: np.ndarray) -> Clique:
     return Clique(members, np.int32(members.sum()))
 
 
-def graph_of(edge_bits: np.ndarray, mask: np.ndarray):  # noqa: ANN201
+def graph_of(edge_bits: np.ndarray, mask: np.ndarray):
     """The consistency graph as a ``networkx.Graph`` on the usable matches, to look inside."""
     import networkx as nx
 

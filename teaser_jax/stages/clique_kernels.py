@@ -17,18 +17,18 @@ LOW6 = np.uint64(63)
 
 
 @intrinsic
-def _popcount(_, word):  # noqa: ANN001, ANN202
-    def emit(context, builder, signature, args):  # noqa: ANN001, ANN202, ARG001
+def _popcount(_, word):
+    def emit(context, builder, signature, args):
         return builder.ctpop(args[0])
 
     return types.uint64(types.uint64), emit
 
 
 @intrinsic
-def _lowest(_, word):  # noqa: ANN001, ANN202
+def _lowest(_, word):
     """Index of the lowest set bit of a nonzero word."""
 
-    def emit(context, builder, signature, args):  # noqa: ANN001, ANN202, ARG001
+    def emit(context, builder, signature, args):
         from llvmlite import ir
 
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))

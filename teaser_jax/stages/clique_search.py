@@ -65,7 +65,7 @@ class _OutOfBudget(Exception):
 class _Search:
     """One search. ``best`` (original numbers) and ``upper`` are valid at any moment."""
 
-    def __init__(self, kernels, edge_bits, members, upper, nodes, seconds):  # noqa: ANN001
+    def __init__(self, kernels, edge_bits, members, upper, nodes, seconds):
         self.kernels = kernels
         self.deadline = time.perf_counter() + seconds
         self.nodes_left = nodes
@@ -227,7 +227,7 @@ def _unpack(row: np.ndarray, n: int) -> np.ndarray:
     return np.unpackbits(little, bitorder="little", count=n).astype(bool)
 
 
-def _load_kernels():  # noqa: ANN202
+def _load_kernels():
     """The compiled kernels, or None without numba. Says one line if it has to compile."""
     global _kernels
     with _loading:

@@ -25,9 +25,7 @@ def rounding_margin(
     difference make at most five times eps times the largest norm on either side. Eight covers the
     sum and the addition of the bounds.
     """
-    reach = [
-        jnp.sqrt(jnp.max(jnp.where(mask, jnp.sum(x * x, axis=1), 0), initial=0)) for x in (src, dst)
-    ]
+    reach = [jnp.sqrt(jnp.max(jnp.where(mask, jnp.sum(x * x, axis=1), 0), initial=0)) for x in (src, dst)]
     return 8 * jnp.finfo(src.dtype).eps * (jnp.abs(scale) * reach[0] + reach[1])
 
 

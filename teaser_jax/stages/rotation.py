@@ -72,14 +72,18 @@ def listed_tims(
 
 
 def complete_tims(
-    src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"], mask: Bool[Array, " n"]
+    src: Float[Array, "n 3"],
+    dst: Float[Array, "n 3"],
+    noise_bound: Float[Array, " n"],
+    mask: Bool[Array, " n"],
 ) -> Tims:
     """All TIMs among the points of the mask, in O(n^2) work but never O(n^2) numbers."""
     n, dtype = src.shape[0], src.dtype
 
     def weighed(rotation: Array, weigh: Weigh, visited: PairSlice) -> tuple[Array, Array]:
         difference = [
-            visited.dst_tims[i] - sum(rotation[i, j] * visited.src_tims[j] for j in range(3)) for i in range(3)
+            visited.dst_tims[i] - sum(rotation[i, j] * visited.src_tims[j] for j in range(3))
+            for i in range(3)
         ]
         r2 = sum(d * d for d in difference) / visited.bounds**2
         return jnp.where(visited.valid, r2, 0), jnp.where(visited.valid, weigh(r2), 0)

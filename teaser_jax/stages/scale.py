@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.stages.invariants import (
-    PairSlice, fold_pairs, safe_norm, safe_sqrt, squared_norm, tim_bounds, tims, trims, words,
+    PairSlice,
+    fold_pairs,
+    safe_norm,
+    safe_sqrt,
+    squared_norm,
+    tim_bounds,
+    tims,
+    trims,
+    words,
 )  # fmt: skip
 from teaser_jax.stages.voting import vote
+from teaser_jax.types import Criterion
 
 ScalePairs = UInt32[Array, "n w"] | Bool[Array, " m"]
 
@@ -25,7 +34,7 @@ def estimate_scale(
     *,
     cbar2: Float[Array, ""],
     pairs: Int[Array, "m 2"] | None = None,
-    criterion: Literal["tls", "consensus"] = "tls",
+    criterion: Criterion = "tls",
     scale_range: tuple[Any, Any] = (0.0, float("inf")),
 ) -> tuple[Float[Array, ""], ScalePairs]:
     """The TLS scale of all TRIMs (11), or of those of the given pairs, and its consensus set.
@@ -111,13 +120,13 @@ def _complete_trims(src: Array, dst: Array, noise_bound: Array, mask: Array) -> 
     """TRIMs of every unordered pair once: row k holds the pairs (i, i + k mod n)."""
     n = src.shape[0]
     half = n // 2
-    wrap = lambda x: jnp.concatenate([x, x[..., :half]], axis=-1)  # noqa: E731
+    wrap = lambda x: jnp.concatenate([x, x[..., :half]], axis=-1)
     a2, b2, beta2, mask2 = (wrap(x) for x in (src.T, dst.T, noise_bound, mask))
 
     index = jnp.arange(n, dtype=jnp.int32)
 
     def row(k: Array) -> tuple[Array, Array, Array]:
-        shift = lambda x: lax.dynamic_slice_in_dim(x, k, n, axis=-1)  # noqa: E731
+        shift = lambda x: lax.dynamic_slice_in_dim(x, k, n, axis=-1)
         a, b = shift(a2) - src.T, shift(b2) - dst.T
         values, bounds = trims(a.T, b.T, shift(beta2) + noise_bound)
         once = (2 * k != n) | (index < half)  # half way round, pairs would come twice

@@ -8,6 +8,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax.stages.voting import vote
+from teaser_jax.types import Criterion
 
 
 def estimate_translation(
@@ -16,7 +17,7 @@ def estimate_translation(
     mask: Bool[Array, " n"],
     *,
     cbar2: Float[Array, ""],
-    criterion: str = "tls",
+    criterion: Criterion = "tls",
 ) -> tuple[Float[Array, "3"], Bool[Array, "n 3"]]:
     """The TLS translation of each axis (13), and the points that agree with it.
 

@@ -120,7 +120,7 @@ def log_false_alarms(
 
 
 def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Int[Array, " k"]:
-    """Further matches that agree with poses through one inlier, turned evenly over SO(3) away from the candidate.
+    """Further matches that agree with poses through one inlier, turned evenly over SO(3).
 
     Inliers that huddle within the noise stay together whatever the turn, and many-to-one matches
     too: they count as chance, as they should.

@@ -7,11 +7,14 @@ running sums of the quadratic costs, meets every consensus set once.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+
+from teaser_jax.types import Criterion
+
 
 class Vote(NamedTuple):
     """The winning consensus set and its estimate [unit of the measurements]."""
@@ -27,7 +30,7 @@ def vote(
     *,
     mask: Bool[Array, " k"] | None = None,
     cbar2: Float[Array, ""] | float = 1.0,
-    criterion: Literal["tls", "consensus"] = "tls",
+    criterion: Criterion = "tls",
     interval: tuple[Float[Array, ""] | float, Float[Array, ""] | float] = (-jnp.inf, jnp.inf),
 ) -> Vote:
     """The global optimum of sum_k min((x - s_k)^2 / alpha_k^2, c-bar^2).
