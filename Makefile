@@ -14,6 +14,10 @@ ifneq ($(wildcard ../shared/data),)
 export TEASER_JAX_DATA ?= $(abspath ../shared/data)
 endif
 
+# Most of a test run is compilation: programs are kept beside the environment that made them.
+test slow notebooks: export JAX_COMPILATION_CACHE_DIR ?= $(abspath $(VENV))/jax-cache
+test slow notebooks: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow lint notebooks bench oldest newest wheel size clean
 
@@ -68,7 +72,7 @@ export QUICKSTART
 
 wheel: $(READY) ## Build the wheel, install it alone and run the quickstart far from the source
 	@rm -rf dist $(VENV)-wheel
-	@$(BIN)/python -m build --outdir dist . >/dev/null
+	@$(BIN)/python -m build --quiet --outdir dist . >/dev/null
 	@! $(BIN)/python -m zipfile -l dist/*.whl | sed 1d | grep -v '^teaser_jax[-/]'
 	@$(PYTHON) -m venv $(VENV)-wheel
 	@$(VENV)-wheel/bin/python $(INSTALL) dist/*.whl

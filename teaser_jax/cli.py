@@ -12,7 +12,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,6 +22,7 @@ import teaser_jax as tj
 from teaser_jax.files import FileError, one_line, read_matches, write_pose
 
 OK, UNTRUSTED, BAD_INPUT = 0, 1, 2
+SIGINT, SIGPIPE = 130, 141  # as shells report a program that these signals end
 
 
 class BadInput(Exception):
@@ -44,9 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return BAD_INPUT
     except BrokenPipeError:  # the reader of a pipe has left: nobody is there to be told
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        return BAD_INPUT
+        return SIGPIPE
     except KeyboardInterrupt:
-        return 130
+        return SIGINT
 
 
 class _Parser(argparse.ArgumentParser):
@@ -124,6 +125,8 @@ def _register(arguments: argparse.Namespace) -> int:
         _check_writable(path, source)
     if plot is not None:
         _check_picture(plot)
+    if output is not None and output == plot:
+        raise BadInput(f"{output}: is named for the pose and for the picture: name two files")
     # A file of an earlier run must not pass for this run's answer.
     _remove(output)
     matches = read_matches(source)
@@ -138,18 +141,19 @@ def _register(arguments: argparse.Namespace) -> int:
     result = _answer(source, matches.src, matches.dst, arguments, known)
     seconds = time.perf_counter() - start
 
-    if arguments.json:
-        print(json.dumps(_report(result, matches.truth, seconds), allow_nan=False))
-    else:
-        print(result)
-        if matches.truth is not None:
-            print(_errors(result.pose, matches.truth, "T_dst_src of the file"))
+    # The picture first, then the pose, then the words: whatever fails, nothing that counts is out yet.
     if plot is not None:
         _draw(plot, matches.src, matches.dst, result)
     if output is not None and result.ok:
         _written(output, lambda: write_pose(output, result.pose))
     elif output is not None:
         print(f"teaser-jax: {output} not written: {result.status.name}", file=sys.stderr)
+    if arguments.json:
+        print(json.dumps(_report(result, matches.truth, seconds), allow_nan=False))
+    else:
+        print(result)
+        if matches.truth is not None:
+            print(_errors(result.pose, matches.truth, "T_dst_src of the file"))
     return OK if result.ok else UNTRUSTED
 
 
@@ -178,7 +182,6 @@ def _demo(arguments: argparse.Namespace) -> int:
     result = profile.result
     precision, recall = tj.metrics.precision_recall(result.inliers, problem.inliers)
     print(result)
-    print()
     print(_errors(result.pose, problem.truth, "truth"))
     print(
         f"  inliers      {precision:.1%} of those found are right, {recall:.1%} of the right ones are found\n"
@@ -197,7 +200,7 @@ def _demo(arguments: argparse.Namespace) -> int:
 def _errors(pose: tj.Pose, truth: tj.Pose, name: str) -> str:
     angle = math.degrees(tj.metrics.rotation_error(pose, truth))
     return (
-        f"Error against the {name}\n"
+        f"\nError against the {name}\n"
         f"  rotation     {angle:.4g} deg\n"
         f"  translation  {float(tj.metrics.translation_error(pose, truth)):.4g}\n"
         f"  scale        {float(tj.metrics.scale_error(pose, truth)):.4g}"
@@ -253,7 +256,7 @@ def _draw(path: Path, src: Any, dst: Any, result: tj.Registration) -> None:
     _written(path, lambda: plot_registration(src, dst, result).savefig(path))
 
 
-def _written(path: Path, write: Any) -> None:
+def _written(path: Path, write: Callable[[], object]) -> None:
     try:
         write()
     except OSError as error:
@@ -267,6 +270,8 @@ def _check_writable(path: Path | None, source: Path | None) -> None:
     folder = path.parent
     if path.is_dir():
         raise BadInput(f"{path}: is a folder: name a file to write")
+    if path.exists() and not path.is_file():
+        raise BadInput(f"{path}: is no ordinary file: name one to write")
     if not folder.is_dir():
         raise BadInput(f"{path}: the folder {folder} does not exist: make it first")
     if not os.access(path if path.exists() else folder, os.W_OK):

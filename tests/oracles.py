@@ -13,11 +13,12 @@ import teaser_jax as tj
 
 # Compiled once for all test files: most of a test's time is XLA's.
 _solve = jax.jit(tj.solve)
+DEFAULT = tj.Settings()
 
 
-def solve(*args) -> tj.Solution:
+def solve(problem: tj.Problem, settings: tj.Settings = DEFAULT) -> tj.Solution:
     """``tj.solve`` under jit, its answer as numpy."""
-    return jax.device_get(_solve(*args))
+    return jax.device_get(_solve(problem, settings))
 
 
 class Matches(NamedTuple):

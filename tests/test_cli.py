@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import teaser_jax as tj
-from teaser_jax import cli
+from teaser_jax import cli, plots
 
 
 @pytest.fixture
@@ -113,6 +114,18 @@ def test_no_trustworthy_answer_leaves_no_pose_behind(wrong, tmp_path, capsys):
     assert report["status"] == out.split()[2]
 
 
+@pytest.mark.parametrize("draws", [True, False])
+def test_nothing_is_said_when_something_cannot_be_written(matches, tmp_path, capsys, monkeypatch, draws):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(*((plots, "plot_registration", full) if draws else (cli, "write_pose", full)))
+    output, plot = tmp_path / "T.txt", tmp_path / "p.png"
+    arguments = ["register", matches, "--noise-bound", 0.0554, "-o", output, "--plot", plot]
+    assert "cannot be written: No space left on device" in bad_input(capsys, *arguments)
+    assert not output.exists()
+
+
 def test_bad_input_leaves_no_pose_behind_either(tmp_path, capsys):
     output = tmp_path / "T.txt"
     output.write_text("the pose of an earlier run")
@@ -131,7 +144,10 @@ def test_bad_input_leaves_no_pose_behind_either(tmp_path, capsys):
         (["register", "{m}", "--noise-bound", "nan"], "noise_bound contains nan"),
         (["register", "{m}", "--noise-bound", "inf"], "noise_bound contains inf"),
         (["register", "{m}", "--noise-bound", "-1"], "noise_bound contains -1"),
-        (["register", "{m}", "--noise-bound", "1", "--scale", "big"], "neither a number nor the word estimate"),
+        (
+            ["register", "{m}", "--noise-bound", "1", "--scale", "big"],
+            "neither a number nor the word estimate",
+        ),
         (["register", "{m}", "--noise-bound", "1", "--scale", "0"], "scale is 0"),
         (["register", "{m}", "--noise-bound", "1", "--cbar2", "nan"], "cbar2 is nan"),
         (["register", "{m}", "--noise-bound", "1", "--clique", "big"], "invalid choice: 'big'"),
@@ -139,13 +155,18 @@ def test_bad_input_leaves_no_pose_behind_either(tmp_path, capsys):
         (["register", "{m}", "--noise-bound", "1", "-o", "{d}/no/T.txt"], "does not exist: make it first"),
         (["register", "{m}", "--noise-bound", "1", "-o", "{m}"], "is the file of matches"),
         (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.bmp2"], "end the name in .png"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "{null}"], "is no ordinary file"),
+        (
+            ["register", "{m}", "--noise-bound", "1", "-o", "{d}/a.png", "--plot", "{d}/a.png"],
+            "name two files",
+        ),
         (["register", "{d}/none.npz", "--noise-bound", "1"], "no such file"),
         (["demo", "--plot", "{d}/no/demo.png"], "does not exist: make it first"),
         (["demo", "--seed", "-1"], "-1 is no seed"),
     ],
 )
 def test_bad_arguments(matches, tmp_path, capsys, arguments, message):
-    filled = [a.format(m=matches, d=tmp_path) for a in arguments]
+    filled = [a.format(m=matches, d=tmp_path, null=os.devnull) for a in arguments]
     assert message in bad_input(capsys, *filled)
     assert matches.exists()
 
@@ -169,7 +190,8 @@ def test_bad_arrays(tmp_path, capsys, arrays, message):
 
 NUMBERS = hnp.arrays(
     st.sampled_from([np.float64, np.float32, np.int32, np.uint8, np.bool_, np.complex64]),
-    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5) | st.tuples(st.integers(0, 20), st.just(3)),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=5)
+    | st.tuples(st.integers(0, 20), st.just(3)),
 )
 
 
@@ -209,7 +231,13 @@ def test_demo(tmp_path, small, capsys, monkeypatch):
     path = tmp_path / "demo.png"
     assert cli.main(["demo", "--plot", str(path)]) == 0
     out, err = capsys.readouterr()
-    for part in ("32 matches, 16 of them wrong", "ok: OK", "proved maximum", "refinement", f"Picture: {path}"):
+    for part in (
+        "32 matches, 16 of them wrong",
+        "ok: OK",
+        "proved maximum",
+        "refinement",
+        f"Picture: {path}",
+    ):
         assert part in out
     assert err == ""
     assert path.read_bytes().startswith(b"\x89PNG")

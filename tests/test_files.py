@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import teaser_jax as tj
-from teaser_jax.files import TEXT, FileError, Matches, one_line, read_matches, write_pose
+from teaser_jax.files import TEXT, FileError, one_line, read_matches, write_pose
 
 RNG = np.random.default_rng(0)
 SRC, DST = RNG.normal(size=(2, 5, 3))
@@ -41,6 +41,15 @@ def reason(path) -> str:
     assert message.startswith(f"{path}: ")
     assert len(message.splitlines()) == 1
     return message
+
+
+def complaint(path) -> str:
+    """Why the file cannot be read, or nothing; any other exception is a crash."""
+    try:
+        read_matches(path)
+    except FileError as error:
+        return str(error)
+    return ""
 
 
 def test_archives_hold_points_and_what_is_known(tmp_path):
@@ -122,14 +131,14 @@ def test_no_file_and_no_file_but_a_folder(tmp_path):
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(content=st.binary(max_size=300) | st.text(max_size=200).map(str.encode), suffix=st.sampled_from(["npz", "csv", "txt"]))
+@given(
+    content=st.binary(max_size=300) | st.text(max_size=200).map(str.encode),
+    suffix=st.sampled_from(["npz", "csv", "txt"]),
+)
 def test_noise_is_refused_or_read_but_never_crashes(tmp_path, content, suffix):
     path = tmp_path / f"m.{suffix}"
     path.write_bytes(content)
-    try:
-        assert isinstance(read_matches(path), Matches)
-    except FileError as error:
-        assert len(str(error).splitlines()) == 1
+    assert len(complaint(path).splitlines()) <= 1
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -141,10 +150,7 @@ def test_damaged_archives_are_refused_or_read_but_never_crash(tmp_path, data):
     cut = data.draw(st.integers(0, len(content)))
     path = tmp_path / "m.npz"
     path.write_bytes(bytes(content[:cut]))
-    try:
-        assert isinstance(read_matches(path), Matches)
-    except FileError as error:
-        assert len(str(error).splitlines()) == 1
+    assert len(complaint(path).splitlines()) <= 1
 
 
 def test_poses_are_written_exactly_and_whole(tmp_path):

@@ -10,28 +10,28 @@ from pathlib import Path
 
 import nbformat
 import pytest
-from jupyter_client.kernelspec import KernelSpecManager
-from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
 
 import teaser_jax
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-NOTEBOOKS = [pytest.param(FOLDER / f"{name}.ipynb", id=name) for name in ("01_quickstart", "02_inside_the_method")]
+NOTEBOOKS = [FOLDER / "01_quickstart.ipynb", FOLDER / "02_inside_the_method.ipynb"]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS)
-def test_runs(path: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in surroundings(tmp_path).items():
+        monkeypatch.setenv(name, value)
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(
-        notebook, km=this_python(tmp_path), timeout=300, resources={"metadata": {"path": str(tmp_path)}}
+        notebook, kernel_name="python3", timeout=300, resources={"metadata": {"path": str(tmp_path)}}
     )
-    client.execute(env=environment(tmp_path))
+    client.execute()
     counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == "code"]
     assert counts == list(range(1, len(counts) + 1))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_stored_output(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
@@ -46,23 +46,16 @@ def test_stored_output(path: Path) -> None:
     assert machine is None, "a path of some machine is stored"
 
 
-def this_python(folder: Path) -> AsyncKernelManager:
-    """A kernel in the interpreter of the tests, whatever kernels the user has registered."""
+def surroundings(folder: Path) -> dict[str, str]:
+    """A kernel in the interpreter of the tests, the package under test, no screen, no start-up files."""
     spec = folder / "kernels" / "python3" / "kernel.json"
     spec.parent.mkdir(parents=True)
     start = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
     spec.write_text(json.dumps({"argv": start, "display_name": "tests", "language": "python"}))
-    kernels = KernelSpecManager(kernel_dirs=[str(spec.parents[1])])
-    return AsyncKernelManager(kernel_name="python3", kernel_spec_manager=kernels)
-
-
-def environment(folder: Path) -> dict[str, str]:
-    """No screen, no start-up files of the user, and the package under test, installed or not."""
-    package = str(Path(teaser_jax.__file__).parents[1])
-    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [str(Path(teaser_jax.__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {
-        **os.environ,
-        "MPLBACKEND": "agg",
+        "JUPYTER_PATH": str(folder),  # its kernels come before any that the user has registered
         "IPYTHONDIR": str(folder / "ipython"),
+        "MPLBACKEND": "agg",
         "PYTHONPATH": os.pathsep.join(paths),
     }

@@ -44,7 +44,9 @@ def test_the_model_fits_the_unit_cube_tightly():
 def test_rotations_and_balls_are_uniform():
     rng = np.random.default_rng(0)
     rotations = np.stack([synthetic.random_rotation(rng) for _ in range(4000)])
-    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-12
+    )
     np.testing.assert_allclose(np.linalg.det(rotations), 1)
     # Uniform on SO(3), traces have mean 0 and variance 1, and every entry has variance 1/3.
     traces = np.trace(rotations, axis1=1, axis2=2)
@@ -107,7 +109,9 @@ def test_a_mesh_gives_any_number_of_points_by_area():
     mesh = synthetic.Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     points = synthetic.sample_model(np.random.default_rng(0), 4000, mesh)
     np.testing.assert_array_equal(points[:, 2], 0)
-    np.testing.assert_allclose(np.quantile(points[:, :2], [0.25, 0.5, 0.75], axis=0).T, [[0.25, 0.5, 0.75]] * 2, atol=0.03)
+    np.testing.assert_allclose(
+        np.quantile(points[:, :2], [0.25, 0.5, 0.75], axis=0).T, [[0.25, 0.5, 0.75]] * 2, atol=0.03
+    )
 
 
 def test_descriptors_err_towards_few_points():

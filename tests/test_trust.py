@@ -1,0 +1,111 @@
+"""The verdict: each question by itself, on problems made to fail just that one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import teaser_jax as tj
+from teaser_jax.stages import trust
+from teaser_jax.synthetic import random_problem, random_rotation
+
+BOUND = 0.05
+
+
+def status(src, dst, **known) -> tj.Status:
+    return tj.register(src, dst, noise_bound=known.pop("noise_bound", BOUND), **known).status
+
+
+def moved(points, seed=0):
+    """The points under a random rigid motion, with a little noise."""
+    rng = np.random.default_rng(seed)
+    return points @ random_rotation(rng).T + rng.uniform(-1, 1, 3) + 0.003 * rng.normal(size=points.shape)
+
+
+def cloud(n=60, seed=1):
+    return np.random.default_rng(seed).uniform(size=(n, 3))
+
+
+def test_right_matches_are_ok():
+    src = cloud()
+    assert status(src, moved(src)) == tj.Status.OK
+
+
+def test_three_clean_matches_among_few_are_not_beyond_chance():
+    # Any three matches that agree on their distances make a perfect pose: that alone is no evidence.
+    src = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0.5]])
+    assert status(src, moved(src)) == tj.Status.NO_CONSENSUS
+
+
+@pytest.mark.parametrize("n", [32, 64, 256])
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_matches_are_never_ok(n, seed):
+    problem = random_problem((n, seed), n=n, outlier_rate=1.0, radius=1.0)
+    assert status(problem.src, problem.dst) != tj.Status.OK
+
+
+def test_a_mirror_image_has_no_pose():
+    src = cloud()
+    assert status(src, moved(src * [1, 1, -1])) == tj.Status.NO_CONSENSUS
+
+
+def test_a_line_does_not_determine_a_rotation():
+    src = np.linspace(0, 1, 40)[:, None] * [1.0, 2.0, 0.5]
+    assert status(src, moved(src)) == tj.Status.DEGENERATE
+
+
+def test_a_plane_does():
+    src = cloud() * [1, 1, 0]
+    assert status(src, moved(src)) == tj.Status.OK
+
+
+def test_coincident_points_determine_nothing():
+    assert status(np.ones((40, 3)), np.zeros((40, 3))) == tj.Status.DEGENERATE
+
+
+def test_a_source_within_the_noise_determines_nothing():
+    src = 0.04 * cloud()
+    assert status(src, moved(src)) == tj.Status.DEGENERATE
+
+
+def test_too_few_points():
+    src = cloud(2)
+    assert status(src, moved(src)) == tj.Status.TOO_FEW_POINTS
+    src = cloud(40)
+    assert status(src, moved(src), mask=np.arange(40) < 2) == tj.Status.TOO_FEW_POINTS
+
+
+def test_the_first_failure_sticks():
+    # A single usable point is also degenerate and without consensus.
+    src = np.zeros((40, 3))
+    assert status(src, src, mask=np.arange(40) < 1) == tj.Status.TOO_FEW_POINTS
+
+
+def test_an_iteration_cap_is_reported():
+    problem = random_problem(3, n=60, outlier_rate=0.5)
+    capped = tj.Settings(refine_iterations=1)
+    full = tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound)
+    found = tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound, settings=capped)
+    assert full.ok
+    settled = np.array_equal(found.inliers, full.inliers)
+    assert found.status == (tj.Status.OK if settled and found.ok else tj.Status.NOT_CONVERGED)
+
+
+def test_turns_are_rotations_far_from_none_and_spread():
+    turns = trust.TURNS
+    assert len(turns) >= 60
+    np.testing.assert_allclose(np.swapaxes(turns, 1, 2) @ turns, np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
+    assert np.all(np.linalg.det(turns) > 0)
+    assert np.all(tj.so3.rotation_angle(turns) > np.deg2rad(45))
+    # Evenly: the mean of the matrices of uniform rotations is zero; the missing small turns pull a little.
+    assert np.abs(turns.mean(axis=0)).max() < 0.2
+
+
+def test_inliers_that_huddle_count_as_chance(x64):
+    # Forty matches within the noise of each other agree with any pose through one of them.
+    n = 64
+    src = np.concatenate([0.01 * cloud(40), 5 + cloud(24)])
+    problem = tj.make_problem(src, src, noise_bound=BOUND)
+    pose = tj.Pose(np.eye(3), np.zeros(3), np.ones(()))
+    counts = np.asarray(trust.chance_inliers(problem, pose, np.arange(n) < 40))
+    assert counts.min() == 39
