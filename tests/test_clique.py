@@ -88,7 +88,8 @@ def stacked(cases: list[Case]) -> tuple[np.ndarray, np.ndarray]:
 
 
 batched = {
-    method: jax.jit(jax.vmap(partial(maximum_clique, method=method))) for method in ("exact", "greedy", "none")
+    method: jax.jit(jax.vmap(partial(maximum_clique, method=method)))
+    for method in ("exact", "greedy", "none")
 }
 one_exact = jax.jit(maximum_clique)
 
@@ -124,7 +125,9 @@ def test_greedy_proves_the_easy_ones():
     found = jax.tree.map(np.asarray, batched["greedy"](*stacked(cases)))
     proved = found.members.sum(axis=1) == found.upper_bound
     assert proved[: len(cases)].all()
-    assert not np.all([c.number == f.upper_bound for c, f in zip(random_cases(), answers("greedy", False), strict=True)])
+    assert not np.all(
+        [c.number == f.upper_bound for c, f in zip(random_cases(), answers("greedy", False), strict=True)]
+    )
 
 
 def test_none_returns_all_usable_matches():
@@ -140,7 +143,9 @@ def test_a_batch_equals_a_loop():
 
 
 def test_the_callback_equals_the_host_search():
-    for case, greedy, exact in zip(random_cases(), answers("greedy", False), answers("exact", False), strict=True):
+    for case, greedy, exact in zip(
+        random_cases(), answers("greedy", False), answers("exact", False), strict=True
+    ):
         found = search_on_host(pack(case.dense), case.mask, greedy)
         np.testing.assert_array_equal(found.members, exact.members)
         assert int(found.upper_bound) == exact.upper_bound
@@ -149,7 +154,10 @@ def test_the_callback_equals_the_host_search():
 def test_networkx_is_exact_too():
     run = jax.jit(jax.vmap(partial(maximum_clique, method="networkx")))
     edge_bits, mask = stacked(special_cases())
-    chosen = [list(SPECIAL).index(k) for k in ("one vertex", "no edge", "complete", "Petersen", "two cliques", "barbell")]
+    chosen = [
+        list(SPECIAL).index(k)
+        for k in ("one vertex", "no edge", "complete", "Petersen", "two cliques", "barbell")
+    ]
     found = run(edge_bits[chosen], mask[chosen])
     for k, i in enumerate(chosen):
         check(special_cases()[i], Clique(found.members[k], found.upper_bound[k]), maximum=True)
@@ -185,7 +193,11 @@ def test_masked_vertices_stay_out():
     rng = np.random.default_rng(2)
     dense, mask = random_graph(rng, N, 0.5, planted=12), rng.uniform(size=N) < 0.7
     dense &= mask[:, None] & mask
-    check(Case(dense, mask, clique_number(dense[np.ix_(mask, mask)])), one_exact(pack(dense), mask), maximum=True)
+    check(
+        Case(dense, mask, clique_number(dense[np.ix_(mask, mask)])),
+        one_exact(pack(dense), mask),
+        maximum=True,
+    )
 
 
 def test_the_order_of_vertices_does_not_matter():
@@ -213,7 +225,8 @@ def start_of(dense: np.ndarray) -> Clique:
 
 
 @pytest.mark.parametrize(
-    ("n", "density", "planted"), [(150, 0.5, 0), (200, 0.3, 0), (300, 0.1, 25), (120, 0.7, 30), (500, 0.05, 0)]
+    ("n", "density", "planted"),
+    [(150, 0.5, 0), (200, 0.3, 0), (300, 0.1, 25), (120, 0.7, 30), (500, 0.05, 0)],
 )
 def test_larger_graphs(n, density, planted):
     dense = random_graph(np.random.default_rng(n), n, density, planted)
@@ -229,7 +242,9 @@ def test_exact_from_any_start():
             check(case, Clique(members, upper), maximum=True)
 
 
-@pytest.mark.parametrize("budget", [dict(nodes=0), dict(nodes=1), dict(nodes=100), dict(seconds=0.0), dict(seconds=1e-3)], ids=str)
+@pytest.mark.parametrize(
+    "budget", [dict(nodes=0), dict(nodes=1), dict(nodes=100), dict(seconds=0.0), dict(seconds=1e-3)], ids=str
+)
 def test_out_of_budget_the_set_is_a_clique_and_the_bound_holds(budget):
     rng = np.random.default_rng(3)
     unproved = 0
@@ -274,4 +289,6 @@ def test_graph_of_is_the_graph():
     case = random_cases()[5]
     graph = graph_of(pack(case.dense), case.mask)
     np.testing.assert_array_equal(sorted(graph), np.flatnonzero(case.mask))
-    np.testing.assert_array_equal(nx.to_numpy_array(graph, nodelist=sorted(graph)), case.dense[np.ix_(case.mask, case.mask)])
+    np.testing.assert_array_equal(
+        nx.to_numpy_array(graph, nodelist=sorted(graph)), case.dense[np.ix_(case.mask, case.mask)]
+    )

@@ -107,7 +107,10 @@ def test_nearly_coincident_source_points_at_the_limit(dtype):
     rng = np.random.default_rng(3)
     for gap in 10.0 ** np.arange(-9 if dtype == np.float64 else -6, -2):
         src, dst = rng.uniform(-1, 1, (2, N, 3))
-        for points, length in ((src, gap), (dst, (0.1 + gap) * (1 - 10 ** rng.uniform(-15, -6, (N // 2, 1))))):
+        for points, length in (
+            (src, gap),
+            (dst, (0.1 + gap) * (1 - 10 ** rng.uniform(-15, -6, (N // 2, 1)))),
+        ):
             direction = rng.normal(size=(N // 2, 3))
             points[1::2] = points[::2] + length * direction / np.linalg.norm(direction, axis=1, keepdims=True)
         src, dst = src.astype(dtype), dst.astype(dtype)
@@ -139,7 +142,9 @@ def test_right_matches_form_a_clique():
     # Theorem 6.
     for seed in range(5):
         matches = random_matches(seed, N, scale=1.5)
-        inside = edges(matches.src, matches.dst, matches.noise_bound, scale=1.5)[np.ix_(matches.inliers, matches.inliers)]
+        inside = edges(matches.src, matches.dst, matches.noise_bound, scale=1.5)[
+            np.ix_(matches.inliers, matches.inliers)
+        ]
         assert np.all(inside | np.eye(len(inside), dtype=bool))
 
 
@@ -182,7 +187,9 @@ def test_repeats_and_direction_of_pairs_do_not_matter():
     matches = random_matches(9, N)
     pairs = np.random.default_rng(1).integers(0, N, (150, 2))
     once = edges(matches.src, matches.dst, 0.05, pairs=np.concatenate([pairs, pairs]))
-    np.testing.assert_array_equal(edges(matches.src, matches.dst, 0.05, pairs=np.concatenate([pairs[:, ::-1], pairs])), once)
+    np.testing.assert_array_equal(
+        edges(matches.src, matches.dst, 0.05, pairs=np.concatenate([pairs[:, ::-1], pairs])), once
+    )
 
 
 def test_all_pairs_given_are_the_complete_graph():
@@ -190,5 +197,6 @@ def test_all_pairs_given_are_the_complete_graph():
     pairs = np.array(list(combinations(range(N), 2)))
     mask = np.random.default_rng(2).uniform(size=N) < 0.9
     np.testing.assert_array_equal(
-        edges(matches.src, matches.dst, 0.05, pairs=pairs, mask=mask), edges(matches.src, matches.dst, 0.05, mask=mask)
+        edges(matches.src, matches.dst, 0.05, pairs=pairs, mask=mask),
+        edges(matches.src, matches.dst, 0.05, mask=mask),
     )

@@ -43,7 +43,9 @@ def imported(path: Path) -> set[str]:
             inner = {f"{base}.{alias.name}".removeprefix(".") for alias in node.names}
             names |= {name for name in inner | {base} if name in modules()}
         if isinstance(node, ast.Import):
-            names |= {a.name.removeprefix("teaser_jax.") for a in node.names if a.name.startswith("teaser_jax.")}
+            names |= {
+                a.name.removeprefix("teaser_jax.") for a in node.names if a.name.startswith("teaser_jax.")
+            }
     return names
 
 

@@ -35,7 +35,9 @@ def test_tims_are_the_incidence_matrix_times_the_points(graph):
 
 def test_tim_bounds_add():
     bounds = np.array([0.1, 0.2, 0.4])
-    np.testing.assert_allclose(invariants.tim_bounds(jnp.asarray(bounds), jnp.array([[0, 1], [2, 1]])), [0.3, 0.6])
+    np.testing.assert_allclose(
+        invariants.tim_bounds(jnp.asarray(bounds), jnp.array([[0, 1], [2, 1]])), [0.3, 0.6]
+    )
 
 
 def test_tims_forget_translation_and_trims_rotation_too():
@@ -101,7 +103,9 @@ def test_fold_meets_each_ordered_pair_of_usable_matches_once(n):
         columns = jnp.arange(invariants.words(n)) * 32 + lane
         return met.at[:, columns].add(jnp.where(visited.valid, 1, 0), mode="drop")
 
-    met = invariants.fold_pairs(mark, jnp.zeros((n, n), int), *(jnp.asarray(x) for x in (src, dst, beta, mask)))
+    met = invariants.fold_pairs(
+        mark, jnp.zeros((n, n), int), *(jnp.asarray(x) for x in (src, dst, beta, mask))
+    )
     np.testing.assert_array_equal(met, mask[:, None] & mask & ~np.eye(n, dtype=bool))
 
 
@@ -128,7 +132,9 @@ def test_fold_hands_out_the_tims_and_bounds_of_the_dense_graph(n):
 @pytest.mark.parametrize("n", [5, 33])
 def test_gradient_through_the_fold_is_the_dense_one(n):
     rng = np.random.default_rng(n)
-    inputs = tuple(jnp.asarray(x) for x in (rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.uniform(1, 2, n)))
+    inputs = tuple(
+        jnp.asarray(x) for x in (rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.uniform(1, 2, n))
+    )
     mask = jnp.asarray(rng.uniform(size=n) < 0.8)
 
     def term(a2, b2, delta):
@@ -142,7 +148,7 @@ def test_gradient_through_the_fold_is_the_dense_one(n):
         return invariants.fold_pairs(add, jnp.zeros(()), src, dst, beta, mask)
 
     def dense(src, dst, beta):
-        square = lambda x: jnp.sum((x[:, None] - x[None]) ** 2, axis=-1)  # noqa: E731
+        square = lambda x: jnp.sum((x[:, None] - x[None]) ** 2, axis=-1)
         valid = mask[:, None] & mask & ~jnp.eye(n, dtype=bool)
         return jnp.sum(jnp.where(valid, term(square(src), square(dst), beta[:, None] + beta), 0))
 

@@ -57,5 +57,6 @@ def surroundings(folder: Path) -> dict[str, str]:
         "JUPYTER_PATH": str(folder),  # its kernels come before any that the user has registered
         "IPYTHONDIR": str(folder / "ipython"),
         "MPLBACKEND": "agg",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",  # compiles in half the time
         "PYTHONPATH": os.pathsep.join(paths),
     }

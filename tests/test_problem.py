@@ -82,14 +82,23 @@ BAD_NUMBERS = {
     "bound NaN": (dict(noise_bound=np.nan), r"noise_bound contains nan"),
     "bound infinite": (dict(noise_bound=np.inf), r"noise_bound contains infinity"),
     "one bad bound": (dict(noise_bound=with_entry(np.ones(8), 3, -2)), r"noise_bound contains -2"),
-    "bounds of another length": (dict(noise_bound=np.ones(7)), r"noise_bound has shape \(7,\).*one a match, \(8,\)"),
+    "bounds of another length": (
+        dict(noise_bound=np.ones(7)),
+        r"noise_bound has shape \(7,\).*one a match, \(8,\)",
+    ),
     "bounds as a column": (dict(noise_bound=np.ones((8, 1))), r"noise_bound has shape \(8, 1\)"),
     "bound as text": (dict(noise_bound="0.1"), r"noise_bound has dtype"),
     "no bound": (dict(noise_bound=None), r"noise_bound has dtype object"),
     "mask of another length": (dict(mask=np.ones(7, bool)), r"mask has shape \(7,\).*\(8,\) truth values"),
     "mask of numbers": (dict(mask=np.ones(8)), r"mask has .*float64.*truth values"),
-    "confidence negative": (dict(confidence=with_entry(np.ones(8), 0, -0.1)), r"confidence contains a negative"),
-    "confidence NaN": (dict(confidence=with_entry(np.ones(8), 0, np.nan)), r"confidence contains .*non-finite"),
+    "confidence negative": (
+        dict(confidence=with_entry(np.ones(8), 0, -0.1)),
+        r"confidence contains a negative",
+    ),
+    "confidence NaN": (
+        dict(confidence=with_entry(np.ones(8), 0, np.nan)),
+        r"confidence contains .*non-finite",
+    ),
     "confidence of another length": (dict(confidence=np.ones(9)), r"confidence has shape \(9,\)"),
     "scale zero": (dict(scale=0), r"scale is 0.*above 0"),
     "scale negative": (dict(scale=-1.0), r"scale is -1.*above 0"),
@@ -117,7 +126,9 @@ def test_bad_input_is_refused_with_advice(function, case):
 
 
 def test_far_from_the_origin_float32_is_refused_and_register_named():
-    with pytest.raises(ValueError, match=r"coordinates reach 5e\+05.*float32.*Subtract a common origin.*register\(\)"):
+    with pytest.raises(
+        ValueError, match=r"coordinates reach 5e\+05.*float32.*Subtract a common origin.*register\(\)"
+    ):
         make(GOOD + 5e5, GOOD, noise_bound=0.1)
     with pytest.raises(ValueError, match="1 %"):
         make(GOOD, GOOD + 5e5, noise_bound=0.1)
@@ -197,7 +208,9 @@ def test_a_networkx_graph_gives_its_edges():
     graph = nx.path_graph(8)
     graph.add_edge(np.int64(0), np.int64(7))
     problem = make(pairs=graph)
-    assert {frozenset(pair) for pair in np.asarray(problem.pairs).tolist()} == {frozenset(e) for e in graph.edges}
+    assert {frozenset(pair) for pair in np.asarray(problem.pairs).tolist()} == {
+        frozenset(e) for e in graph.edges
+    }
     assert make(pairs=nx.empty_graph(8)).pairs.shape == (0, 2)
 
 

@@ -71,7 +71,7 @@ def test_no_other_pose_nearby_fits_better():
     matches = random_matches(2, N, wrong=0.3, scale=1.2)
     weights = np.random.default_rng(2).uniform(size=N)
     best = jax.tree.map(np.asarray, fit(matches.src, matches.dst, weights))
-    cost = lambda pose: np.sum(weights[:, None] * (matches.dst - pose.apply(matches.src)) ** 2)  # noqa: E731
+    cost = lambda pose: np.sum(weights[:, None] * (matches.dst - pose.apply(matches.src)) ** 2)
     rng = np.random.default_rng(3)
     for _ in range(50):
         vector = 1e-3 * rng.normal(size=7)
@@ -107,7 +107,9 @@ def test_derivatives_agree_with_central_differences(known):
     read = jax.jit(lambda s, d, w, x: fit_similarity(s, d, w, x if known else None).pose.matrix)
     point = (matches.src, matches.dst, np.random.default_rng(4).uniform(0.5, 1, N), scale)
     direction = tuple(np.random.default_rng(5).normal(size=np.shape(x)) for x in point)
-    ahead, behind = (read(*(x + s * 1e-6 * d for x, d in zip(point, direction, strict=True))) for s in (1, -1))
+    ahead, behind = (
+        read(*(x + s * 1e-6 * d for x, d in zip(point, direction, strict=True))) for s in (1, -1)
+    )
     central = (ahead - behind) / 2e-6
     forward = jax.jit(lambda p, d: jax.jvp(read, p, d)[1])(point, direction)
     np.testing.assert_allclose(forward, central, atol=1e-7)

@@ -14,7 +14,12 @@ from oracles import in_ball, pack, random_matches, random_rotation, unpack
 
 from teaser_jax import so3
 from teaser_jax.stages.rotation import (
-    complete_tims, correlation, correlation_of_pairs, estimate_rotation, listed_tims, ring_tims,
+    complete_tims,
+    correlation,
+    correlation_of_pairs,
+    estimate_rotation,
+    listed_tims,
+    ring_tims,
 )  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("x64")
@@ -65,7 +70,7 @@ def gnc_weight(r2: np.ndarray, mu: float, cbar2: float) -> np.ndarray:
 def gnc_by_the_book(data: Measured, cbar2: float, factor: float, iterations: int):
     """The rotation, its members and how many TIMs carry it, in plain numpy."""
     inverse2 = data.bounds**-2.0
-    residuals = lambda r: np.sum((data.dst - data.src @ r.T) ** 2, axis=1) * inverse2  # noqa: E731
+    residuals = lambda r: np.sum((data.dst - data.src @ r.T) ** 2, axis=1) * inverse2
     rotation = wahba(inverse2, data.src, data.dst)
     largest, last = residuals(rotation).max(), np.inf
     if 2 * largest - cbar2 <= 0:
@@ -185,7 +190,7 @@ def test_the_complete_graph_is_the_list_of_all_pairs():
     i, j = pairs.T
 
     def both(rotation):
-        weigh = lambda r2: jnp.clip(2 - r2, 0, 1)  # noqa: E731
+        weigh = lambda r2: jnp.clip(2 - r2, 0, 1)
         complete = complete_tims(*map(jnp.asarray, (matches.src, matches.dst, bounds, mask)))
         listed = listed_tims(
             *map(jnp.asarray, (matches.src[j] - matches.src[i], matches.dst[j] - matches.dst[i])),

@@ -156,7 +156,9 @@ def test_read_out_is_the_weighted_mean_of_the_chosen(given):
     values, alpha = trims_of(src, dst, bounds, pairs)
     members = np.abs(values - float(scale)) <= alpha
     weight = confidence[pairs[:, 0]] * confidence[pairs[:, 1]] * members / alpha**2
-    read = scale_of_pairs(*map(jnp.asarray, (src, dst, bounds, confidence)), chosen, pairs=pairs if given else None)
+    read = scale_of_pairs(
+        *map(jnp.asarray, (src, dst, bounds, confidence)), chosen, pairs=pairs if given else None
+    )
     assert float(read) == pytest.approx(np.sum(weight * values) / np.sum(weight), rel=1e-12)
 
 
@@ -170,7 +172,7 @@ def test_gradient_of_the_read_out_is_the_central_difference(given):
     point = tuple(map(jnp.asarray, (src, dst, bounds, np.full(n, 0.7))))
     rng = np.random.default_rng(1)
     direction = tuple(jnp.asarray(rng.normal(size=x.shape)) for x in point)
-    step = lambda sign: read(*(x + sign * 1e-6 * d for x, d in zip(point, direction, strict=True)))  # noqa: E731
+    step = lambda sign: read(*(x + sign * 1e-6 * d for x, d in zip(point, direction, strict=True)))
     gradient = jax.grad(read, argnums=(0, 1, 2, 3))(*point)
     slope = sum(float(jnp.sum(g * d)) for g, d in zip(gradient, direction, strict=True))
     assert slope == pytest.approx(float(step(1) - step(-1)) / 2e-6, abs=1e-7)
@@ -179,7 +181,9 @@ def test_gradient_of_the_read_out_is_the_central_difference(given):
 def test_no_choice_reads_as_zero_with_finite_gradient():
     src, dst, bounds, _ = inputs(random_matches(8, 12))
     nothing = jnp.zeros((12, 1), jnp.uint32)
-    value, slope = jax.value_and_grad(lambda s: scale_of_pairs(s, dst, bounds, jnp.ones(12), nothing))(jnp.asarray(src))
+    value, slope = jax.value_and_grad(lambda s: scale_of_pairs(s, dst, bounds, jnp.ones(12), nothing))(
+        jnp.asarray(src)
+    )
     assert value == 0
     assert np.all(np.asarray(slope) == 0)
 
@@ -188,7 +192,9 @@ def test_no_choice_reads_as_zero_with_finite_gradient():
 
 
 def test_float32_points_vote_in_float64():
-    data = [x.astype(np.float32) if x.dtype.kind == "f" else x for x in inputs(random_matches(9, 12, scale=1.8))]
+    data = [
+        x.astype(np.float32) if x.dtype.kind == "f" else x for x in inputs(random_matches(9, 12, scale=1.8))
+    ]
     wide, _ = estimate(*(x.astype(float) if x.dtype.kind == "f" else x for x in data))
     with jax.enable_x64(False):
         narrow, _ = estimate(*data)

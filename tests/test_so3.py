@@ -62,7 +62,9 @@ def check_nearest(matrix: np.ndarray, dtype: str) -> None:
     assert found.dtype == dtype
     found, matrix = found.astype(float), matrix.astype(float)
     tolerance = TOLERANCE[dtype]
-    np.testing.assert_allclose(found @ found.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=tolerance)
+    np.testing.assert_allclose(
+        found @ found.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=tolerance
+    )
     np.testing.assert_allclose(np.linalg.det(found), 1, atol=tolerance)
     size = np.maximum(np.abs(matrix).max(axis=(1, 2)), np.finfo(dtype).tiny)
     reached = np.sum(found * matrix, axis=(1, 2))
@@ -105,7 +107,9 @@ def test_singular_frames_rebuild_the_matrix(kind, x64):
     np.testing.assert_allclose(rebuilt / size, matrix / size, atol=1e-13)
     for frame in (left, right):
         np.testing.assert_allclose(np.linalg.det(frame), 1, atol=1e-13)
-        np.testing.assert_allclose(frame @ frame.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=1e-13)
+        np.testing.assert_allclose(
+            frame @ frame.swapaxes(1, 2), np.tile(np.eye(3), (len(matrix), 1, 1)), atol=1e-13
+        )
     slack = 1e-13 * size[:, 0, 0]
     assert np.all(values[:, 0] >= values[:, 1] - slack)
     assert np.all(values[:, 1] >= np.abs(values[:, 2]) - slack)
@@ -147,7 +151,9 @@ def test_derivative_is_finite_everywhere(kind, x64):
 def special_rotations() -> np.ndarray:
     """Identity, half turns about axes and between them, tiny and almost half turns, random ones."""
     rng = np.random.default_rng(4)
-    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(40, 3)), [[1, 1, 0], [1, 1, 1], [0, 1, -1]]])
+    axes = np.concatenate(
+        [np.eye(3), -np.eye(3), rng.normal(size=(40, 3)), [[1, 1, 0], [1, 1, 1], [0, 1, -1]]]
+    )
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     angles = [0, 1e-9, 1e-4, 1, np.pi / 2, np.pi - 1e-4, np.pi - 1e-9, np.pi]
     return np.concatenate([Rotation.from_rotvec(angle * axes).as_matrix() for angle in angles])

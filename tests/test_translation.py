@@ -94,7 +94,7 @@ def test_read_out_is_the_weighted_mean_of_each_axis():
 def test_an_axis_without_points_reads_as_zero_with_finite_gradient():
     offsets, bounds, _ = offsets_of(8)
     members = jnp.ones((N, 3), bool).at[:, 1].set(False)
-    read = lambda x, b: translation_of_points(x, b, jnp.ones(N), members)  # noqa: E731
+    read = lambda x, b: translation_of_points(x, b, jnp.ones(N), members)
     assert read(jnp.asarray(offsets), jnp.asarray(bounds))[1] == 0
     slopes = jax.jit(jax.jacrev(read, argnums=(0, 1)))(offsets, bounds)
     assert all(np.all(np.isfinite(s)) for s in slopes)
@@ -107,7 +107,9 @@ def test_gradient_of_the_read_out_is_the_central_difference():
     read = jax.jit(lambda *x: jnp.sum(translation_of_points(*x, members) * jnp.array([1, 2, 3])))
     point = (offsets, bounds, np.full(N, 0.7))
     direction = tuple(np.random.default_rng(1).normal(size=x.shape) for x in point)
-    ahead, behind = (read(*(x + s * 1e-6 * d for x, d in zip(point, direction, strict=True))) for s in (1, -1))
+    ahead, behind = (
+        read(*(x + s * 1e-6 * d for x, d in zip(point, direction, strict=True))) for s in (1, -1)
+    )
     gradient = jax.jit(jax.grad(read, argnums=(0, 1, 2)))(*point)
     slope = sum(np.sum(g * d) for g, d in zip(gradient, direction, strict=True))
     assert slope == pytest.approx(float(ahead - behind) / 2e-6, abs=1e-6)

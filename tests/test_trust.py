@@ -94,7 +94,9 @@ def test_an_iteration_cap_is_reported():
 def test_turns_are_rotations_far_from_none_and_spread():
     turns = trust.TURNS
     assert len(turns) >= 60
-    np.testing.assert_allclose(np.swapaxes(turns, 1, 2) @ turns, np.broadcast_to(np.eye(3), turns.shape), atol=1e-12)
+    np.testing.assert_allclose(
+        np.swapaxes(turns, 1, 2) @ turns, np.broadcast_to(np.eye(3), turns.shape), atol=1e-12
+    )
     assert np.all(np.linalg.det(turns) > 0)
     assert np.all(tj.so3.rotation_angle(turns) > np.deg2rad(45))
     # Evenly: the mean of the matrices of uniform rotations is zero; the missing small turns pull a little.

@@ -35,7 +35,9 @@ def test_composition_applies_the_right_pose_first(kind, batch, x64):
     outer, inner = as_kind(poses(0, batch), kind), as_kind(poses(1, batch), kind)
     points = np.random.default_rng(2).normal(size=(*batch, 7, 3))
     np.testing.assert_allclose((outer @ inner).apply(points), outer.apply(inner.apply(points)), atol=1e-13)
-    np.testing.assert_allclose((outer @ inner).matrix, np.asarray(outer.matrix) @ np.asarray(inner.matrix), atol=1e-13)
+    np.testing.assert_allclose(
+        (outer @ inner).matrix, np.asarray(outer.matrix) @ np.asarray(inner.matrix), atol=1e-13
+    )
 
 
 @both_kinds
@@ -55,7 +57,9 @@ def test_matrix_acts_on_columns_as_apply_on_rows(kind, batch, x64):
     points = np.random.default_rng(5).normal(size=(*batch, 7, 3))
     ahead = np.concatenate([points, np.ones((*batch, 7, 1))], axis=-1) @ np.swapaxes(pose.matrix, -1, -2)
     np.testing.assert_allclose(pose.apply(points), ahead[..., :3], atol=1e-13)
-    np.testing.assert_array_equal(np.asarray(pose.matrix)[..., 3, :], np.broadcast_to([0, 0, 0, 1], (*batch, 4)))
+    np.testing.assert_array_equal(
+        np.asarray(pose.matrix)[..., 3, :], np.broadcast_to([0, 0, 0, 1], (*batch, 4))
+    )
 
 
 @both_kinds
@@ -104,7 +108,13 @@ def test_quat_and_scipy_agree():
 
 @pytest.mark.parametrize(
     "matrix",
-    [np.diag([1.0, 1, -1, 1]), np.diag([1.0, 2, 1, 1]), np.zeros((4, 4)), np.full((4, 4), np.nan), np.ones((4, 4))],
+    [
+        np.diag([1.0, 1, -1, 1]),
+        np.diag([1.0, 2, 1, 1]),
+        np.zeros((4, 4)),
+        np.full((4, 4), np.nan),
+        np.ones((4, 4)),
+    ],
     ids=["mirrored", "stretched", "zero", "nan", "ones"],
 )
 def test_from_matrix_refuses_what_is_no_similarity(matrix):
