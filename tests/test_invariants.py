@@ -154,8 +154,8 @@ def test_gradient_through_the_fold_is_the_dense_one(n):
 
     found, expected = (jax.jit(jax.value_and_grad(f, argnums=(0, 1, 2)))(*inputs) for f in (folded, dense))
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-13)
-    for found, expected in zip(found[1], expected[1], strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    for slope, right in zip(found[1], expected[1], strict=True):
+        np.testing.assert_allclose(slope, right, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(("n", "expected"), [(0, 0), (1, 1), (32, 1), (33, 2), (64, 2)])
