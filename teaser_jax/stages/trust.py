@@ -136,7 +136,7 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
     def further(turn: Array, pivot: Array) -> Array:
         moved = pose.scale * so3.rotate(turn, src - src[pivot]) + dst[pivot]
         agree = mask & (jnp.sum((dst - moved) ** 2, axis=1) <= reach2)
-        return jnp.sum(agree, dtype=jnp.int32) - mask[pivot]
+        return jnp.sum(agree, dtype=jnp.int32) - mask[pivot].astype(jnp.int32)
 
     high = lax.Precision.HIGHEST
     turns = jnp.einsum("kij,jl->kil", jnp.asarray(TURNS, src.dtype), pose.rotation, precision=high)
