@@ -239,13 +239,15 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
         raise ValueError("no row of src and dst is finite: every match holds NaN or infinity.")
     if usable.any():
         largest = float(max(np.abs(src[usable]).max(), np.abs(dst[usable]).max()))
-        # Lengths appear to the fourth power in the test of edges.
-        if max(largest, float(noise_bound[usable].max())) > float(jnp.finfo(dtype).max) ** 0.25 / 10:
+        kind, bound = jnp.finfo(dtype), float(noise_bound[usable].min())
+        # Lengths and bounds appear to the fourth power in the test of edges.
+        most, least = float(kind.max) ** 0.25 / 10, float(kind.tiny) ** 0.25 * 10
+        if max(largest, float(noise_bound[usable].max())) > most or bound < least:
             raise ValueError(
-                f"coordinates reach {largest:.3g}, beyond what {dtype} can square and compare: rescale the "
-                "points and noise_bound to a sensible unit, and look for corrupt rows."
+                f"coordinates reach {largest:.3g} and noise_bound is {bound:.3g}, beyond what {dtype} can "
+                "square and compare: rescale both to a sensible unit, and look for corrupt rows."
             )
-        rounding, bound = float(jnp.finfo(dtype).eps) * largest, float(noise_bound[usable].min())
+        rounding = float(kind.eps) * largest
         if rounding > 0.01 * bound:
             raise ValueError(
                 f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % "

@@ -18,7 +18,7 @@ from teaser_jax.types import CliqueMethod, Pose, Problem, Selection, Settings, S
 SMALLEST_BUCKET = 32
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """The answer of ``register``: host values in float64, in the input's frames and order.
 
@@ -39,7 +39,7 @@ class Registration:
         """Whether to trust the pose."""
         return self.status == Status.OK
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return summary(self)
 
 
@@ -89,10 +89,12 @@ def register(
     )  # fmt: skip
     centred, origins = centre(problem)
     padded = to_bucket(centred)
+    # The device never reads the budgets of the host: without them, new budgets compile nothing.
+    on_device = replace(settings, clique_nodes=1, clique_seconds=0.0)
     with jax.enable_x64(True):
-        graph, found = before_clique(padded, settings)
+        graph, found = before_clique(padded, on_device)
         clique = between(padded, graph, found, settings)
-        solution = jax.device_get(after_clique(padded, graph, clique, settings))
+        solution = jax.device_get(after_clique(padded, graph, clique, on_device))
     return registration_of(solution, problem, origins)
 
 

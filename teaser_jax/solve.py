@@ -172,6 +172,8 @@ def find_translation(
 ) -> tuple[Pose, Bool[Array, "n 3"]]:
     """The vote of each axis (13): the cascade's pose, and the members behind its translation."""
     p, _ = usable_rows(problem)
+    # Confidences weigh in the final fit only: they say how good a right match is, not which are right.
+    p = replace(p, confidence=p.mask.astype(p.src.dtype))
     scale, rotation = _positive(scale), _rotation_of(p, members, chosen)
     offsets = p.dst - scale * so3.rotate(rotation, p.src)
     translation, axes = estimate_translation(

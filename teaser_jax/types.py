@@ -141,6 +141,11 @@ class Settings:
                 raise ValueError(
                     f"Settings.{name} is {getattr(self, name)!r}: expected a whole number above 0."
                 )
+        if isinstance(self.gnc_factor, float | int) and not self.gnc_factor > 1:
+            raise ValueError(f"Settings.gnc_factor is {self.gnc_factor!r}: expected a number above 1.")
+        low, high = self.scale_range
+        if isinstance(low, float | int) and isinstance(high, float | int) and not low < high:
+            raise ValueError(f"Settings.scale_range is {self.scale_range!r}: expected (low, high).")
         if not self.clique_seconds >= 0:
             raise ValueError(
                 f"Settings.clique_seconds is {self.clique_seconds!r}: expected 0 or more seconds."

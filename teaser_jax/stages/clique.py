@@ -52,17 +52,18 @@ def greedy_clique(edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> C
 
 def _grow(edge_bits: Array, mask: Array, seed: Array) -> Array:
     n = mask.shape[0]
+    index = jnp.arange(n, dtype=seed.dtype)
     neighbours = edge_bits[seed]
     candidates = bits.unpack(neighbours, n)
     priority = bits.count(edge_bits & neighbours)
     # Candidates joined to all others belong in together: a clean graph needs no loop at all.
-    universal = candidates & (priority >= jnp.sum(candidates) - 1)
-    clique = universal | ((jnp.arange(n) == seed) & mask)
+    universal = candidates & (priority >= jnp.sum(candidates, dtype=jnp.int32) - 1)
+    clique = universal | ((index == seed) & mask)
 
     def take(state: tuple[Array, Array]) -> tuple[Array, Array]:
         clique, candidates = state
-        chosen = jnp.argmax(jnp.where(candidates, priority, -1))
-        joined = clique | ((jnp.arange(n) == chosen) & jnp.any(candidates))
+        chosen = jnp.argmax(jnp.where(candidates, priority, -1)).astype(seed.dtype)
+        joined = clique | ((index == chosen) & jnp.any(candidates))
         return joined, candidates & bits.unpack(edge_bits[chosen], n)
 
     return lax.while_loop(lambda s: jnp.any(s[1]), take, (clique, candidates & ~universal))[0]

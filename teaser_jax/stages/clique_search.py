@@ -239,7 +239,7 @@ def _load_kernels():
             log.warning("numba is not installed: hard cliques are searched by networkx, slowly")
             return None
         notice = threading.Timer(
-            1.5, log.warning, ["compiling the clique search, once on this machine (about 10 s)"]
+            3.0, log.warning, ["compiling the clique search, once on this machine (about 10 s)"]
         )
         notice.daemon = True
         notice.start()

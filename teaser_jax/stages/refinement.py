@@ -50,7 +50,8 @@ def fit_similarity(
     if scale is None:
         below = jnp.sum(weights[:, None] * a * a)
         some = below > 0
-        scale = jnp.where(some, jnp.sum(rotation * h) / jnp.where(some, below, 1), 1)
+        scale = jnp.sum(rotation * h) / jnp.where(some, below, 1)
+        scale = jnp.where(some & (scale > 0), scale, 1)
     translation = dst_mean - scale * so3.rotate(rotation, src_mean[None])[0]
     return Fit(Pose(rotation, translation, scale), h)
 

@@ -119,7 +119,7 @@ def estimate_rotation(
     gnc_factor: Float[Array, ""] | float = 1.4,
     tolerance: Float[Array, ""] | float = 1e-6,
     iterations: int = 100,
-    dtype: jnp.dtype = jnp.float32,
+    dtype: jnp.dtype,
 ) -> Rotation:
     """GNC-TLS: a rotation and the TIMs that agree with it.
 

@@ -53,12 +53,18 @@ def judge(
 
     Gradients: none; inputs must be stopped by the caller.
     """
-    members, agreeing = jnp.sum(clique), jnp.sum(inliers)
+    dtype = problem.src.dtype
+    members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
     alarms = log_false_alarms(problem, pose, inliers, bits.count(edge_bits))
-    collapsed = agreeing < LEAST_SHARE_OF_CLIQUE * members if pruned else jnp.zeros((), bool)
+    collapsed = (
+        agreeing.astype(dtype) < LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
+        if pruned
+        else jnp.zeros((), bool)
+    )
     questions = (
         (jnp.sum(problem.mask) < 3, Status.TOO_FEW_POINTS),
-        ((members < 3) | (agreeing < 3), Status.NO_CONSENSUS),
+        # Three matches that agree on their distances always make a pose: they are no evidence.
+        ((members < 3) | (agreeing <= 3), Status.NO_CONSENSUS),
         (~is_determined(problem, pose, inliers), Status.DEGENERATE),
         ((alarms > LARGEST_LOG_FALSE_ALARMS) | collapsed, Status.NO_CONSENSUS),
         (~converged, Status.NOT_CONVERGED),
