@@ -143,7 +143,7 @@ class Settings:
                 )
         if isinstance(self.gnc_factor, float | int) and not self.gnc_factor > 1:
             raise ValueError(f"Settings.gnc_factor is {self.gnc_factor!r}: expected a number above 1.")
-        low, high = self.scale_range
+        low, high = self.scale_range if isinstance(self.scale_range, tuple) else (None, None)
         if isinstance(low, float | int) and isinstance(high, float | int) and not low < high:
             raise ValueError(f"Settings.scale_range is {self.scale_range!r}: expected (low, high).")
         if not self.clique_seconds >= 0:
