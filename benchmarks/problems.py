@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,9 @@ def all_wrong(trials: dict[int, int]) -> Iterator[Case]:
 
 
 def real_pairs() -> Iterator[Case]:
-    """Every real pair at the noise bound of its data set."""
+    """Every real pair at the noise bound of its data set; says so where there is none."""
+    if not any((DATA / folder).is_dir() for folder in REAL):
+        warnings.warn(f"no real pairs in {DATA}: name their folder in TEASER_JAX_DATA", stacklevel=2)
     for folder, (bound, rotation, translation) in REAL.items():
         for path in sorted((DATA / folder).glob("*.npz")):
             z = np.load(path)
