@@ -46,7 +46,7 @@ lint: $(READY) ## Check style, format and types
 	@$(BIN)/mypy
 
 notebooks: $(READY) ## Run the notebooks and keep their output
-	@$(BIN)/jupyter-execute --inplace notebooks/*.ipynb
+	@$(BIN)/python notebooks/run.py
 
 bench: $(READY) ## Run the benchmarks, for instance: make bench ARGS="--quick --only accuracy"
 	@$(BIN)/python -m benchmarks $(ARGS)

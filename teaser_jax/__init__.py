@@ -1,6 +1,6 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
 
-from teaser_jax import metrics, synthetic
+from teaser_jax import files, metrics, plots, so3, synthetic
 from teaser_jax.problem import make_problem, stack_problems
 from teaser_jax.profile import Profile, profile
 from teaser_jax.register import Registration, register
@@ -11,6 +11,6 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Pose", "Problem", "Profile", "Registration", "Selection", "Settings", "Solution", "Status",
-    "make_problem", "metrics", "profile", "refit", "register", "select", "solve", "stack_problems",
-    "synthetic",
+    "files", "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "so3",
+    "solve", "stack_problems", "synthetic",
 ]  # fmt: skip

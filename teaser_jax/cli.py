@@ -198,12 +198,12 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 
 def _errors(pose: tj.Pose, truth: tj.Pose, name: str) -> str:
-    angle = math.degrees(tj.metrics.rotation_error(pose, truth))
+    error = tj.metrics.errors(pose, truth)
     return (
         f"\nError against the {name}\n"
-        f"  rotation     {angle:.4g} deg\n"
-        f"  translation  {float(tj.metrics.translation_error(pose, truth)):.4g}\n"
-        f"  scale        {float(tj.metrics.scale_error(pose, truth)):.4g}"
+        f"  rotation     {error.rotation_deg:.4g} deg\n"
+        f"  translation  {float(error.translation):.4g}\n"
+        f"  scale        {float(error.scale):.4g}"
     )
 
 
@@ -233,10 +233,11 @@ def _report(result: tj.Registration, truth: tj.Pose | None, seconds: float) -> d
         "seconds": round(seconds, 6),
     }
     if truth is not None:
+        error = tj.metrics.errors(pose, truth)
         report["error"] = {
-            "rotation_deg": _plain(np.degrees(tj.metrics.rotation_error(pose, truth))),
-            "translation": _plain(tj.metrics.translation_error(pose, truth)),
-            "scale": _plain(tj.metrics.scale_error(pose, truth)),
+            "rotation_deg": _plain(error.rotation_deg),
+            "translation": _plain(error.translation),
+            "scale": _plain(error.scale),
         }
     return report
 

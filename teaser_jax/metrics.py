@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from teaser_jax import so3
 from teaser_jax.types import Pose
+
+
+class PoseErrors(NamedTuple):
+    """The three errors of a pose, each of the kind and batch shape of the poses compared."""
+
+    rotation: Any  # angle [rad]
+    translation: Any  # distance [length]
+    scale: Any  # absolute difference [-]
+
+    @property
+    def rotation_deg(self) -> Any:
+        """The angle in degrees."""
+        return np.degrees(self.rotation)
+
+
+def errors(estimate: Pose, truth: Pose) -> PoseErrors:
+    """All three errors of a pose at once."""
+    return PoseErrors(
+        rotation_error(estimate, truth), translation_error(estimate, truth), scale_error(estimate, truth)
+    )
 
 
 def rotation_error(estimate: Pose, truth: Pose) -> Any:

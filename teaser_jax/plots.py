@@ -65,7 +65,8 @@ def plot_registration(
     _cloud(before, there, DST)
     _cloud(before, there[inliers], GOOD, size=6)
 
-    verdict = f"After: {inliers.sum()} inliers, {result.status.name}"
+    noun = "inlier" if inliers.sum() == 1 else "inliers"
+    verdict = f"After: {inliers.sum()} {noun}, {result.status.name}"
     _frame(after, here, verdict, INK if result.ok else BAD)
     _cloud(after, back, DST)
     _cloud(after, here, SRC)

@@ -2,10 +2,10 @@
 
     prepare    scale, consistency graph, greedy clique            on the device
     search     exact clique, where the device has no proof        on the host
-    select     rotation, translation, refinement: which measurements to trust
+    choose     rotation, translation, refinement: which measurements to trust
     refit      the pose from those sets, in closed form           gradients flow
 
-``solve`` strings them together inside jit. ``register`` runs the same pieces around the host.
+The first three are ``select``, all four ``solve``. ``register`` runs the same pieces around the host.
 """
 
 from __future__ import annotations
@@ -67,15 +67,20 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
     """
     frozen = lax.stop_gradient(problem)
     graph = prepare(frozen, settings)
-    usable, _ = usable_rows(frozen)
-    clique = maximum_clique(
-        graph.edge_bits,
-        usable.mask,
-        method=settings.clique,
-        nodes=settings.clique_nodes,
-        seconds=settings.clique_seconds,
-    )
+    clique = find_clique(frozen, graph, settings)
     return conclude(problem, graph, clique, settings)
+
+
+def select(problem: Problem, settings: Settings = Settings()) -> Selection:
+    """Which measurements to trust: the discrete half of ``solve``, without its verdict.
+
+    ``refit(problem, select(problem))`` is the pose of ``solve(problem)``.
+
+    Gradients: none, the sets are choices. Differentiate ``refit``.
+    """
+    frozen = lax.stop_gradient(problem)
+    graph = prepare(frozen, settings)
+    return choose(frozen, graph, find_clique(frozen, graph, settings), settings)[0]
 
 
 def prepare(problem: Problem, settings: Settings = Settings()) -> Graph:
@@ -103,10 +108,21 @@ def find_edges(problem: Problem, scale: Float[Array, ""]) -> UInt32[Array, "n w"
     return consistency_graph(p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs)
 
 
+def find_clique(problem: Problem, graph: Graph, settings: Settings = Settings()) -> Clique:
+    """The largest set of matches that agree pairwise; asks the host where the device has no proof."""
+    return maximum_clique(
+        graph.edge_bits,
+        usable_rows(problem)[0].mask,
+        method=settings.clique,
+        nodes=settings.clique_nodes,
+        seconds=settings.clique_seconds,
+    )
+
+
 def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()) -> Solution:
     """Everything behind the clique: the sets, the pose, and whether to trust it."""
     graph, clique = lax.stop_gradient((graph, clique))
-    selection, converged = select(lax.stop_gradient(problem), graph, clique, settings)
+    selection, converged = choose(lax.stop_gradient(problem), graph, clique, settings)
     pose = _refit(problem, selection, refined=settings.refine)
     p, excluded = usable_rows(problem)
     frozen_pose = lax.stop_gradient(pose)
@@ -128,12 +144,12 @@ def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings 
     )
 
 
-def select(
+def choose(
     problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()
 ) -> tuple[Selection, Bool[Array, ""]]:
     """Which measurements to trust, given the clique, and whether every iteration settled.
 
-    Gradients: none; ``solve`` stops the inputs.
+    Gradients: none; the caller stops the inputs.
     """
     members = clique.members & usable_rows(problem)[0].mask
     turned = find_rotation(problem, graph.scale, members, settings)

@@ -53,3 +53,10 @@ def test_batches_and_jax_arrays_keep_their_kind():
 )
 def test_precision_and_recall(found, right, precision, recall):
     assert metrics.precision_recall(found, right) == pytest.approx((precision, recall), nan_ok=True)
+
+
+def test_errors_are_the_three_at_once():
+    estimate, truth = pose((0, 0, 0.1), (0, 3, 4), 1.5), pose()
+    found = metrics.errors(estimate, truth)
+    assert found == pytest.approx((0.1, 5.0, 0.5))
+    assert found.rotation_deg == pytest.approx(math.degrees(0.1))

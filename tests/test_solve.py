@@ -104,6 +104,7 @@ def test_the_pose_is_the_read_out_of_the_selection(scale, x64):
     problem = problem_of(matches_of(1), scale=scale, confidence=np.linspace(0.1, 1, N))
     solution = solve(problem)
     assert pose_error(refit(problem, solution.selection), solution.pose) <= 1e-12
+    jax.tree.map(np.testing.assert_array_equal, jax.jit(tj.select)(problem), solution.selection)
 
 
 # --- laws -----------------------------------------------------------------------------------------
