@@ -49,3 +49,11 @@ def test_leading_axes_are_a_batch():
     assert packed.shape == (2, 3, 2)
     np.testing.assert_array_equal(bits.unpack(packed, 40), mask)
     np.testing.assert_array_equal(bits.count(packed), mask.sum(axis=-1))
+
+
+@pytest.mark.parametrize("n", [1, 5, 32, 33, 64, 100])
+def test_others_are_all_but_oneself(n):
+    found = bits.others(n)
+    assert found.dtype == jnp.uint32
+    np.testing.assert_array_equal(bits.unpack(found, 32 * found.shape[1])[:, :n], ~np.eye(n, dtype=bool))
+    assert not bits.unpack(found, 32 * found.shape[1])[:, n:].any()

@@ -24,6 +24,15 @@ def unpack(packed: UInt32[Array, "*k w"], n: int) -> Bool[Array, "*k n"]:
     return bits.reshape(*packed.shape[:-1], -1)[..., :n].astype(bool)
 
 
+def others(n: int) -> UInt32[Array, "n w"]:
+    """Rows with every bit set but a row's own, and none beyond n."""
+    index, word = jnp.arange(n, dtype=jnp.int32)[:, None], jnp.arange(words(n), dtype=jnp.int32)[None]
+    own = jnp.uint32(1) << (index % LANES).astype(jnp.uint32)
+    within = jnp.minimum(n - LANES * word, LANES)  # bits of this word that exist: 1 to 32
+    existing = jnp.uint32(0xFFFFFFFF) >> (LANES - within).astype(jnp.uint32)
+    return jnp.where(index // LANES == word, existing & ~own, existing)
+
+
 def count(packed: UInt32[Array, "*k w"]) -> Int[Array, "*k"]:
     """Number of set bits along the last axis."""
     return jnp.sum(lax.population_count(packed), axis=-1, dtype=jnp.int32)

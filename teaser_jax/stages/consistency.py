@@ -34,13 +34,16 @@ def lengths_agree(
 ) -> Bool[Array, "*k"]:
     """| |b| - |a| | <= d from squared lengths: (A - B)^2 <= d^2 (2 (A + B) - d^2), or A + B <= d^2.
 
-    The same verdict without square roots, which would be most of the work. Where one length is
-    nearly zero and the other nearly d, both sides are d^4 and their difference has a double root:
-    there the rounding of d^4 itself is added, which admits lengths up to d (1 + sqrt(8 eps)).
+    The same verdict without square roots, which would be most of the work. Both cases are
+    (A - B)^2 <= d^2 max(2 (A + B) - d^2, A + B): the second term is the larger one where
+    A + B <= d^2, and then (A - B)^2 <= (A + B)^2 is below. Where one length is nearly zero and the
+    other nearly d, both sides are d^4 and their difference has a double root: there the rounding
+    of d^4 itself is added, which admits lengths up to d (1 + sqrt(8 eps)). A tolerance of NaN
+    agrees with nothing.
     """
     difference, total, tolerance2 = src_squared - dst_squared, src_squared + dst_squared, tolerance**2
-    rounding = 8 * jnp.finfo(total.dtype).eps * tolerance2**2
-    return (difference**2 <= tolerance2 * (2 * total - tolerance2) + rounding) | (total <= tolerance2)
+    rounding = 8 * jnp.finfo(total.dtype).eps * tolerance2
+    return difference**2 <= tolerance2 * (jnp.maximum(2 * total - tolerance2, total) + rounding)
 
 
 def consistency_graph(
@@ -64,29 +67,28 @@ def consistency_graph(
     References: section VI-D, eq. (9), Theorem 6.
     """
     src, dst, noise_bound, scale, cbar2 = lax.stop_gradient((src, dst, noise_bound, scale, cbar2))
-    c, scale2 = jnp.sqrt(cbar2), scale * scale
+    n = src.shape[0]
     margin = rounding_margin(src, dst, mask, scale)
+    scaled, reach = scale * src, jnp.sqrt(cbar2) * noise_bound + margin / 2
 
     if pairs is None:
 
         def mark(rows: Array, lane: Array, visited: PairSlice) -> Array:
-            edge = visited.valid & lengths_agree(
-                scale2 * squared_norm(visited.src_tims),
-                squared_norm(visited.dst_tims),
-                c * visited.bounds + margin,
+            edge = lengths_agree(
+                squared_norm(visited.src_tims), squared_norm(visited.dst_tims), visited.bounds
             )
             return rows | (edge.astype(jnp.uint32) << lane.astype(jnp.uint32))
 
-        n = src.shape[0]
+        # Masked matches reach NaN far, which spares a test in each of n^2 pairs.
         empty = jnp.zeros((n, words(n)), jnp.uint32)
-        return fold_pairs(mark, empty, src, dst, noise_bound, mask)
+        rows = fold_pairs(mark, empty, scaled, dst, jnp.where(mask, reach, jnp.nan), mask)
+        return rows & bits.others(n)
 
     agree = lengths_agree(
-        scale2 * jnp.sum(tims(src, pairs) ** 2, axis=1),
+        jnp.sum(tims(scaled, pairs) ** 2, axis=1),
         jnp.sum(tims(dst, pairs) ** 2, axis=1),
-        c * tim_bounds(noise_bound, pairs) + margin,
+        tim_bounds(reach, pairs),
     )
-    n = src.shape[0]
     dense = mask[:, None] & mask[None] & ~jnp.eye(n, dtype=bool)
     clear = ~agree & usable_pairs(pairs, mask)
     # Pairs that may stay are sent out of range, so that no pair can set a bit again.

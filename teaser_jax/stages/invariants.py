@@ -101,27 +101,28 @@ def fold_pairs(
     """
     n = src.shape[0]
     w = words(n)
-    pad = w * LANES - n
 
-    def lanes(x: Array) -> Array:  # (n, ...) -> (32, w, ...)
-        padded = jnp.pad(x, [(0, pad)] + [(0, 0)] * (x.ndim - 1))
-        return jnp.swapaxes(padded.reshape(w, LANES, *x.shape[1:]), 0, 1)
+    def lanes(x: Array) -> Array:  # (n,) -> (32, w)
+        return jnp.pad(x, (0, w * LANES - n)).reshape(w, LANES).T
 
-    index = jnp.arange(n, dtype=jnp.int32)
-    columns = (lanes(src), lanes(dst), lanes(noise_bound), lanes(mask), lanes(index))
-    rows = index[:, None]
+    # Each component is an array of its own: slices of a common one are not vectorised on the CPU.
+    rows = [x[:, None] for x in (*src.T, *dst.T, noise_bound)]
+    index = jnp.arange(n, dtype=jnp.int32)[:, None]
+    starts = LANES * jnp.arange(w, dtype=jnp.int32)
 
     @jax.checkpoint
     def step(carry: Carry, lane: tuple) -> tuple[Carry, None]:
-        t, a, b, beta, use, index = lane
+        t, use, beta, *columns = lane
+        difference = [row - column for row, column in zip(rows, columns, strict=False)]
         visited = PairSlice(
-            tuple(src[:, k, None] - a[None, :, k] for k in range(3)),
-            tuple(dst[:, k, None] - b[None, :, k] for k in range(3)),
-            noise_bound[:, None] + beta[None],
-            mask[:, None] & use[None] & (rows != index[None]),
+            tuple(difference[:3]),
+            tuple(difference[3:]),
+            rows[6] + beta,
+            mask[:, None] & use & (index != starts + t),
         )
         return body(carry, t, visited), None
 
+    columns = [lanes(x) for x in (mask, noise_bound, *src.T, *dst.T)]
     return lax.scan(step, init, (jnp.arange(LANES, dtype=jnp.int32), *columns))[0]
 
 
