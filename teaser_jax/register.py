@@ -11,9 +11,9 @@ import numpy as np
 from teaser_jax import so3
 from teaser_jax.problem import as_numpy, is_traced, make_problem, pad_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
-from teaser_jax.stages.clique import Clique, maximum_clique, search_on_host
+from teaser_jax.stages.clique import Clique, clique_on_device, search_on_host
 from teaser_jax.stages.invariants import words
-from teaser_jax.types import CliqueMethod, Pose, Problem, Selection, Settings, Solution, Status
+from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
 
 SMALLEST_BUCKET = 32
 
@@ -140,9 +140,8 @@ def before_clique(problem: Problem, settings: Settings) -> tuple[Graph, Clique]:
 
 
 def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:
-    """The clique as far as the device takes it: the greedy one with its bound."""
-    method: CliqueMethod = "none" if settings.clique == "none" else "greedy"
-    return maximum_clique(graph.edge_bits, usable_rows(problem)[0].mask, method=method)
+    """The clique as far as the device takes it, with its bound."""
+    return clique_on_device(graph.edge_bits, usable_rows(problem)[0].mask, method=settings.clique)
 
 
 @jax.jit
