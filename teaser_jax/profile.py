@@ -91,7 +91,7 @@ def profile(
         clique = timed("clique, host", between, padded, graph, found, settings)
         turned = timed("rotation", _find_rotation, padded, scale, clique.members, settings)
         cascade, _ = timed(
-            "translation", _find_translation, padded, scale, clique.members, turned.members, settings
+            "translation", _find_translation, padded, scale, clique.members, turned.rotation, settings
         )
         if settings.refine:
             timed("refinement", _find_inliers, padded, cascade, settings)

@@ -79,7 +79,7 @@ def singular_frames(
 
     Gradients: none are defined here; :func:`nearest_rotation` carries the derivative.
     """
-    left, right = lax.platform_dependent(matrix, cpu=_leading_axes_lapack, default=leading_axes_jacobi)
+    left, right = _leading_axes(matrix)
     left = jnp.stack([left[0], left[1], _cross(left[0], left[1])], axis=1)
     right = jnp.stack([right[0], right[1], _cross(right[0], right[1])], axis=1)
     values = jnp.einsum("ik,ij,jk->k", left, matrix, right, precision=lax.Precision.HIGHEST)
@@ -87,6 +87,10 @@ def singular_frames(
 
 
 Axes = tuple[Float[Array, "2 3"], Float[Array, "2 3"]]
+
+
+def _leading_axes(matrix: Float[Array, "3 3"]) -> Axes:
+    return lax.platform_dependent(matrix, cpu=_leading_axes_lapack, default=leading_axes_jacobi)
 
 
 def _leading_axes_lapack(matrix: Float[Array, "3 3"]) -> Axes:
@@ -134,6 +138,19 @@ def _reject(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, 
     return vector - jnp.sum(vector * axis) * axis
 
 
+def largest_eigenvalue(matrix: Float[Array, "3 3"]) -> Float[Array, ""]:
+    """The largest eigenvalue of a symmetric matrix, in closed form (Smith, Comm. ACM 1961).
+
+    Gradients: none worth having where eigenvalues meet.
+    """
+    mean = jnp.trace(matrix) / 3
+    rest = matrix - mean * jnp.eye(3, dtype=matrix.dtype)
+    spread = jnp.sqrt(jnp.sum(rest * rest) / 6)
+    unit = rest / jnp.where(spread > 0, spread, 1)
+    determinant = jnp.sum(unit[0] * _cross(unit[1], unit[2]))
+    return mean + 2 * spread * jnp.cos(jnp.arccos(jnp.clip(determinant / 2, -1, 1)) / 3)
+
+
 @jax.custom_jvp
 def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """The rotation R that maximises tr(R^T H), the solution of Wahba's problem.
@@ -148,8 +165,9 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
 
     References: Yang, Shi, Carlone, T-RO 2020, eq. (12) without truncation; Horn 1987.
     """
-    left, _, right = singular_frames(matrix)
-    return jnp.einsum("ik,jk->ij", left, right, precision=lax.Precision.HIGHEST)
+    left, right = _leading_axes(matrix)
+    axes = [left[0], left[1], _cross(left[0], left[1])], [right[0], right[1], _cross(right[0], right[1])]
+    return sum(u[:, None] * v[None] for u, v in zip(*axes, strict=True))
 
 
 @nearest_rotation.defjvp

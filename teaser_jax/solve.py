@@ -153,7 +153,7 @@ def choose(
     """
     members = clique.members & usable_rows(problem)[0].mask
     turned = find_rotation(problem, graph.scale, members, settings)
-    cascade, axes = find_translation(problem, graph.scale, members, turned.members, settings)
+    cascade, axes = find_translation(problem, graph.scale, members, turned.rotation, settings)
     inliers, settled = members & jnp.all(axes, axis=1), jnp.ones((), bool)
     if settings.refine:
         inliers, settled = find_inliers(problem, cascade, settings)
@@ -184,13 +184,15 @@ def find_rotation(
 
 
 def find_translation(
-    problem: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], chosen: Array, settings: Settings
+    problem: Problem,
+    scale: Float[Array, ""],
+    members: Bool[Array, " n"],
+    rotation: Float[Array, "3 3"],
+    settings: Settings,
 ) -> tuple[Pose, Bool[Array, "n 3"]]:
     """The vote of each axis (13): the cascade's pose, and the members behind its translation."""
     p, _ = usable_rows(problem)
-    # Confidences weigh in the final fit only: they say how good a right match is, not which are right.
-    p = replace(p, confidence=p.mask.astype(p.src.dtype))
-    scale, rotation = _positive(scale), _rotation_of(p, members, chosen)
+    scale = _positive(scale)
     offsets = p.dst - scale * so3.rotate(rotation, p.src)
     translation, axes = estimate_translation(
         offsets, p.noise_bound, members, cbar2=p.cbar2, criterion=settings.vote

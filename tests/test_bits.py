@@ -57,3 +57,13 @@ def test_others_are_all_but_oneself(n):
     assert found.dtype == jnp.uint32
     np.testing.assert_array_equal(bits.unpack(found, 32 * found.shape[1])[:, :n], ~np.eye(n, dtype=bool))
     assert not bits.unpack(found, 32 * found.shape[1])[:, n:].any()
+
+
+@pytest.mark.parametrize("n", [1, 5, 32, 33, 100, 3000])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_rank_and_list(n, share):
+    mask = np.random.default_rng(n).uniform(size=n) < share
+    np.testing.assert_array_equal(bits.rank(jnp.asarray(mask)), np.cumsum(mask))
+    listed = np.asarray(bits.listed(jnp.asarray(mask)))
+    np.testing.assert_array_equal(listed[: mask.sum()], np.flatnonzero(mask))
+    assert not listed[mask.sum() :].any()

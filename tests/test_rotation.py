@@ -196,14 +196,17 @@ def test_the_complete_graph_is_the_list_of_all_pairs():
             *map(jnp.asarray, (matches.src[j] - matches.src[i], matches.dst[j] - matches.dst[i])),
             *map(jnp.asarray, (bounds[i] + bounds[j], mask[i] & mask[j])),
         )
-        return [(t.measure(rotation, weigh), t.members(rotation, weigh)) for t in (complete, listed)]
+        return [
+            (t.measure(rotation, weigh), t.largest(rotation), t.members(rotation, weigh))
+            for t in (complete, listed)
+        ]
 
-    (complete, rows), (listed, members) = jax.jit(both)(matches.truth.rotation)
+    (complete, complete_largest, rows), (listed, largest, members) = jax.jit(both)(matches.truth.rotation)
     # The complete graph meets every pair from both ends.
     np.testing.assert_allclose(complete.correlation, 2 * listed.correlation, rtol=1e-12)
     np.testing.assert_allclose(complete.cost, 2 * listed.cost, rtol=1e-12)
-    np.testing.assert_allclose(complete.largest, listed.largest, rtol=1e-12)
-    assert bool(complete.soft) == bool(listed.soft)
+    np.testing.assert_allclose(complete_largest, largest, rtol=1e-12)
+    assert complete.soft == 2 * listed.soft > 0
     dense = unpack(rows, 33)
     np.testing.assert_array_equal(dense, dense.T)
     np.testing.assert_array_equal(dense[i, j], members)

@@ -211,3 +211,12 @@ def test_random_rotations_are_uniform(x64):
     np.testing.assert_allclose((rotations**2).mean(axis=0), 1 / 3, atol=5 * 0.3 / np.sqrt(20_000))
     # The angle has density (1 - cos) / pi, so its mean is pi / 2 + 2 / pi.
     assert abs(so3.rotation_angle(rotations).mean() - (np.pi / 2 + 2 / np.pi)) < 0.03
+
+
+def test_largest_eigenvalue_is_that_of_lapack(x64):
+    rng = np.random.default_rng(0)
+    square = rng.normal(size=(300, 3, 3))
+    symmetric = square + square.swapaxes(1, 2)
+    symmetric[:3] = np.zeros((3, 3)), np.eye(3), np.diag([1.0, 1.0, -2.0])
+    found = jax.jit(jax.vmap(so3.largest_eigenvalue))(symmetric)
+    np.testing.assert_allclose(found, np.linalg.eigvalsh(symmetric)[:, -1], atol=1e-12)

@@ -38,6 +38,26 @@ def count(packed: UInt32[Array, "*k w"]) -> Int[Array, "*k"]:
     return jnp.sum(lax.population_count(packed), axis=-1, dtype=jnp.int32)
 
 
+def rank(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """How many are set up to and including each: a running sum in two small products.
+
+    XLA would make log n passes of a cumulative sum on the CPU. Exact: counts stay below 2^24.
+    """
+    n = mask.shape[0]
+    lanes = jnp.pad(mask, (0, words(n) * LANES - n)).reshape(words(n), LANES).astype(jnp.float32)
+    high = lax.Precision.HIGHEST
+    inside = jnp.matmul(lanes, np.triu(np.ones((LANES, LANES), np.float32)), precision=high)
+    before = jnp.matmul(np.tri(words(n), k=-1, dtype=np.float32), inside[:, -1], precision=high)
+    return (inside + before[:, None]).reshape(-1)[:n].astype(jnp.int32)
+
+
+def listed(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """The set positions in order, then zeros."""
+    n = mask.shape[0]
+    place = jnp.where(mask, rank(mask) - 1, n)
+    return jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
+
+
 def unpack_host(packed: np.ndarray, n: int) -> np.ndarray:
     """Words (k, w) as a boolean (k, n) array, in numpy, whatever the machine's byte order."""
     little = np.ascontiguousarray(packed).astype("<u4", copy=False)

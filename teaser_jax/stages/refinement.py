@@ -19,10 +19,11 @@ from teaser_jax.types import Pose
 
 
 class Fit(NamedTuple):
-    """A weighted similarity fit and the correlation matrix behind its rotation."""
+    """A weighted similarity fit and what it was made from."""
 
     pose: Pose
     correlation: Float[Array, "3 3"]  # sum w (b - mean b)(a - mean a)^T
+    src_mean: Float[Array, "3"]
 
 
 def fit_similarity(
@@ -39,11 +40,12 @@ def fit_similarity(
 
     References: Horn, JOSA A 1987; Umeyama, PAMI 1991.
     """
-    total = jnp.sum(weights)
-    total = jnp.where(total > 0, total, 1)
     high = lax.Precision.HIGHEST
-    src_mean = jnp.einsum("n,ni->i", weights, src, precision=high) / total
-    dst_mean = jnp.einsum("n,ni->i", weights, dst, precision=high) / total
+    # All weighted sums in one product: of the weights, of a and of b.
+    columns = jnp.concatenate([jnp.ones_like(src[:, :1]), src, dst], axis=1)
+    sums = jnp.matmul(weights, columns, precision=high)
+    means = sums[1:] / jnp.where(sums[0] > 0, sums[0], 1)
+    src_mean, dst_mean = means[:3], means[3:]
     a, b = src - src_mean, dst - dst_mean
     h = correlation(weights, a, b)
     rotation = so3.nearest_rotation(h)
@@ -52,15 +54,18 @@ def fit_similarity(
         some = below > 0
         scale = jnp.sum(rotation * h) / jnp.where(some, below, 1)
         scale = jnp.where(some & (scale > 0), scale, 1)
-    translation = dst_mean - scale * so3.rotate(rotation, src_mean[None])[0]
-    return Fit(Pose(rotation, translation, scale), h)
+    translation = dst_mean - scale * jnp.sum(rotation * src_mean, axis=1)
+    return Fit(Pose(rotation, translation, scale), h, src_mean)
 
 
 def squared_residuals(
     pose: Pose, src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """|b - s R a - t|^2 / beta^2 of each match [-]. Gradients: exact."""
-    return jnp.sum((dst - pose.apply(src)) ** 2, axis=1) / noise_bound**2
+    # By components: three sums of three fuse into one pass, a product of matrices does not.
+    turned = [sum(pose.rotation[i, j] * src[:, j] for j in range(3)) for i in range(3)]
+    r2 = sum((dst[:, i] - pose.scale * turned[i] - pose.translation[i]) ** 2 for i in range(3))
+    return r2 / noise_bound**2
 
 
 def truncated_cost(
@@ -83,8 +88,7 @@ def refine(
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
     """The inlier set at the end of the descent from ``pose``, and whether it settled.
 
-    Each step can only lower the cost, so the descent ends. It stops early when a set has fewer
-    than three members, which no fit can use.
+    Each step can only lower the cost, so the descent ends.
 
     Gradients: none, the set is a choice; inputs must be stopped by the caller.
 
@@ -103,8 +107,6 @@ def refine(
     def step(state: Descent) -> Descent:
         fit = fit_similarity(src, dst, jnp.where(state.inliers, weights, 0), scale)
         inliers = agree(fit.pose)
-        usable = jnp.sum(state.inliers) >= 3
-        inliers = jnp.where(usable, inliers, state.inliers)
         return Descent(inliers, jnp.all(inliers == state.inliers), state.rounds + 1)
 
     start = Descent(agree(pose), jnp.zeros((), bool), jnp.zeros((), jnp.int32))

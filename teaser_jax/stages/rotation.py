@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
+from teaser_jax.stages import bits
 from teaser_jax.stages.invariants import PairSlice, fold_pairs, words
 
 Weigh = Callable[[Array], Array]  # squared residuals in units of their bounds -> weights in [0, 1]
@@ -24,14 +25,14 @@ class Measured(NamedTuple):
 
     correlation: Float[Array, "3 3"]  # sum of w / delta^2 b a^T
     cost: Float[Array, ""]  # sum of w r^2
-    largest: Float[Array, ""]  # largest r^2
-    soft: Bool[Array, ""]  # a weight lies strictly between 0 and 1
+    soft: Float[Array, ""]  # how many weights lie strictly between 0 and 1
 
 
 class Tims(NamedTuple):
     """A set of TIMs: how to pass over it, and how to write down which of them count."""
 
     measure: Callable[[Float[Array, "3 3"], Weigh], Measured]
+    largest: Callable[[Float[Array, "3 3"]], Float[Array, ""]]  # squared residual
     members: Callable[[Float[Array, "3 3"], Weigh], Array]
 
 
@@ -51,24 +52,28 @@ def listed_tims(
 ) -> Tims:
     """TIMs given one by one. Source TIMs carry the scale already."""
     inverse2 = jnp.where(mask, 1 / jnp.where(mask, bounds, 1) ** 2, 0)
+    columns = jnp.concatenate([src_tims, jnp.ones_like(src_tims[:, :1])], axis=1)
 
     def residuals(rotation: Array) -> Array:
-        return jnp.sum((dst_tims - so3.rotate(rotation, src_tims)) ** 2, axis=1) * inverse2
+        turned = [sum(rotation[i, j] * src_tims[:, j] for j in range(3)) for i in range(3)]
+        return sum((dst_tims[:, i] - turned[i]) ** 2 for i in range(3)) * inverse2
 
     def measure(rotation: Array, weigh: Weigh) -> Measured:
         r2 = residuals(rotation)
         w = jnp.where(mask, weigh(r2), 0)
-        return Measured(
-            correlation(w * inverse2, src_tims, dst_tims),
-            jnp.sum(w * r2),
-            jnp.max(r2, initial=0),
-            jnp.any((w > 0) & (w < 1)),
-        )
+        soft = ((w > 0) & (w < 1)).astype(w.dtype)
+        # One product makes all sums: the correlation, the cost and the count.
+        rows = jnp.stack([*(w * inverse2 * dst_tims[:, i] for i in range(3)), w * r2, soft])
+        sums = jnp.matmul(rows, columns, precision=lax.Precision.HIGHEST)
+        return Measured(sums[:3, :3], sums[3, 3], sums[4, 3])
+
+    def largest(rotation: Array) -> Array:
+        return jnp.max(residuals(rotation), initial=0)
 
     def members(rotation: Array, weigh: Weigh) -> Array:
         return mask & (weigh(residuals(rotation)) > 0.5)
 
-    return Tims(measure, members)
+    return Tims(measure, largest, members)
 
 
 def complete_tims(
@@ -94,13 +99,18 @@ def complete_tims(
             return Measured(
                 so_far.correlation + _pair_correlation(w / visited.bounds**2, visited),
                 so_far.cost + jnp.sum(w * r2),
-                jnp.maximum(so_far.largest, jnp.max(r2, initial=0)),
-                so_far.soft | jnp.any((w > 0) & (w < 1)),
+                so_far.soft + jnp.sum((w > 0) & (w < 1), dtype=jnp.int32).astype(dtype),
             )
 
         zero = jnp.zeros((), dtype)
-        start = Measured(jnp.zeros((3, 3), dtype), zero, zero, jnp.zeros((), bool))
+        start = Measured(jnp.zeros((3, 3), dtype), zero, zero)
         return fold_pairs(add, start, src, dst, noise_bound, mask)
+
+    def largest(rotation: Array) -> Array:
+        def reach(so_far: Array, _: Array, visited: PairSlice) -> Array:
+            return jnp.maximum(so_far, jnp.max(weighed(rotation, jnp.ones_like, visited)[0], initial=0))
+
+        return fold_pairs(reach, jnp.zeros((), dtype), src, dst, noise_bound, mask)
 
     def members(rotation: Array, weigh: Weigh) -> Array:
         def mark(rows: Array, lane: Array, visited: PairSlice) -> Array:
@@ -109,7 +119,7 @@ def complete_tims(
 
         return fold_pairs(mark, jnp.zeros((n, words(n)), jnp.uint32), src, dst, noise_bound, mask)
 
-    return Tims(measure, members)
+    return Tims(measure, largest, members)
 
 
 def estimate_rotation(
@@ -149,8 +159,7 @@ def estimate_rotation(
     def one_round(state: Round) -> Round:
         # One fit a round, and only one in the program: it is what takes longest to compile.
         rotation = so3.nearest_rotation(state.correlation)
-        everything = tims.measure(rotation, jnp.ones_like)
-        excess = 2 * everything.largest - cbar2
+        excess = 2 * tims.largest(rotation) - cbar2
         opening = cbar2 / jnp.where(excess > 0, excess, 1)
         is_first = state.rounds == 0
         gnc_mu = jnp.where(is_first, opening, state.gnc_mu * gnc_factor)
@@ -158,7 +167,7 @@ def estimate_rotation(
         still = jnp.abs(found.cost - state.cost) <= tolerance * jnp.maximum(found.cost, cbar2)
         all_agree = is_first & (excess <= 0)
         kept = jnp.where(all_agree, state.correlation, found.correlation)
-        return Round(kept, gnc_mu, found.cost, all_agree | still | ~found.soft, state.rounds + 1)
+        return Round(kept, gnc_mu, found.cost, all_agree | still | (found.soft < 0.5), state.rounds + 1)
 
     start = tims.measure(jnp.eye(3, dtype=dtype), jnp.ones_like)
     initial = Round(
@@ -179,14 +188,10 @@ def ring_tims(clique: Bool[Array, " n"]) -> Int[Array, "n 2"]:
 
     Rows of points outside the clique hold (i, i).
     """
-    n = clique.shape[0]
-    index = jnp.arange(n, dtype=jnp.int32)
-    # The next member after i: the smallest member index beyond i, else the first member.
-    ahead = lax.cummin(jnp.where(clique, index, n), reverse=True)
-    first = ahead[0] if n else jnp.zeros((), jnp.int32)
-    following = jnp.concatenate([ahead[1:], jnp.full((1,), n, jnp.int32)])[:n]
-    following = jnp.where(following < n, following, first)
-    return jnp.stack([index, jnp.where(clique, following, index)], axis=1)
+    index = jnp.arange(clique.shape[0], dtype=jnp.int32)
+    place = bits.rank(clique)  # of the next member, counted from 0
+    place = jnp.where(place < jnp.sum(clique, dtype=jnp.int32), place, 0)
+    return jnp.stack([index, jnp.where(clique, bits.listed(clique)[place], index)], axis=1)
 
 
 def correlation(

@@ -9,7 +9,8 @@ and wrong; ``benchmarks/trust.py`` measures what they are worth.
 
 from __future__ import annotations
 
-import jax
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -55,7 +56,12 @@ def judge(
     """
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
-    alarms = log_false_alarms(problem, pose, inliers, bits.count(edge_bits))
+    # A match that is listed again says nothing new.
+    once = ~repeats(problem)
+    alarms = log_false_alarms(
+        replace(problem, mask=problem.mask & once), pose, inliers & once, bits.count(edge_bits)
+    )
+    few = jnp.sum(inliers & once, dtype=jnp.int32) <= 3
     collapsed = (
         agreeing.astype(dtype) < LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
         if pruned
@@ -66,7 +72,7 @@ def judge(
         # Three matches that agree on their distances always make a pose: they are no evidence.
         ((members < 3) | (agreeing <= 3), Status.NO_CONSENSUS),
         (~is_determined(problem, pose, inliers), Status.DEGENERATE),
-        ((alarms > LARGEST_LOG_FALSE_ALARMS) | collapsed, Status.NO_CONSENSUS),
+        (few | (alarms > LARGEST_LOG_FALSE_ALARMS) | collapsed, Status.NO_CONSENSUS),
         (~converged, Status.NOT_CONVERGED),
     )
     verdict = jnp.int32(Status.OK)
@@ -75,21 +81,42 @@ def judge(
     return verdict
 
 
+def repeats(problem: Problem) -> Bool[Array, " n"]:
+    """Matches that are exact copies of an earlier row.
+
+    Each row is sent to a slot by a hash of its numbers, and compared with the first row that came
+    there. Two different rows in one slot hide copies from each other: one in sixteen at most.
+    """
+    n = problem.src.shape[0]
+    if n == 0:
+        return jnp.zeros(0, bool)
+    rows = jnp.concatenate([problem.src, problem.dst], axis=1)
+    words = lax.bitcast_convert_type(rows.astype(jnp.float32), jnp.uint32)
+    mixed = jnp.sum(words * HASH[:, 0], axis=1, dtype=jnp.uint32)
+    slots_log2 = max(4, (16 * n - 1).bit_length())
+    slot = ((mixed ^ (mixed >> 15)) * HASH[0, 1] >> (32 - slots_log2)).astype(jnp.int32)
+    index = jnp.arange(n, dtype=jnp.int32)
+    first = jnp.full(1 << slots_log2, n - 1, jnp.int32).at[slot].min(index)[slot]
+    return (first < index) & jnp.all(rows == rows[first], axis=1)
+
+
 def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:
     """Whether the inliers fix the rotation (and with it the scale).
 
-    Turning the fit by an angle about its weakest axis raises the cost (6) by
-    2 s (1 - cos angle)(s_2 + s_3), with the signed singular values of the weighted correlation: a
-    line has none left, a mirror image subtracts them. And a source that shrinks into the noise
-    (s times its diameter within 2 c beta) agrees with every rotation.
+    Turning the pose by an angle about its weakest axis raises the cost (6) by
+    2 s (1 - cos angle)(tr M - largest eigenvalue of M), with M = R^T H the symmetric part of the
+    turned-back correlation: a line has nothing left, a mirror image subtracts it. Weights are those
+    of the fit, the largest confidence counting as one: where two matches have all the weight, the
+    rest cannot hold the pose. And a source that shrinks into the noise (s times its radius within
+    c beta) agrees with every rotation.
     """
-    weights = jnp.where(inliers, 1 / problem.noise_bound**2, 0)
-    fit = fit_similarity(problem.src, problem.dst, weights, pose.scale)
-    _, values, _ = so3.singular_frames(fit.correlation)
-    rise = 2 * (1 - np.cos(SMALLEST_TURN)) * pose.scale * (values[1] + values[2])
-    total = jnp.sum(weights)
-    centre = jnp.sum(weights[:, None] * problem.src, axis=0) / jnp.where(total > 0, total, 1)
-    radius2 = jnp.where(inliers, jnp.sum((problem.src - centre) ** 2, axis=1), 0)
+    weights = jnp.where(inliers, problem.confidence / problem.noise_bound**2, 0)
+    fit = fit_similarity(problem.src, problem.dst, weights, problem.scale)
+    most = jnp.max(jnp.where(inliers, problem.confidence, 0), initial=0)
+    turned = jnp.sum(pose.rotation[:, :, None] * fit.correlation[:, None, :], axis=0)
+    left = jnp.trace(turned) - so3.largest_eigenvalue((turned + turned.T) / 2)
+    rise = 2 * (1 - np.cos(SMALLEST_TURN)) * pose.scale * left / jnp.where(most > 0, most, 1)
+    radius2 = jnp.where(inliers, jnp.sum((problem.src - fit.src_mean) ** 2, axis=1), 0)
     reach2 = jnp.where(inliers, problem.cbar2 * problem.noise_bound**2, jnp.inf)
     extended = pose.scale**2 * jnp.max(radius2, initial=0) > jnp.min(reach2, initial=jnp.inf)
     return (rise >= problem.cbar2) & extended
@@ -134,19 +161,17 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
     src, dst, mask = problem.src, problem.dst, problem.mask
     if src.shape[0] == 0:
         return jnp.zeros(len(TURNS), jnp.int32)
-    rank = jnp.cumsum(inliers)
-    which = jnp.arange(len(TURNS)) % jnp.maximum(rank[-1], 1) + 1
-    pivots = jnp.minimum(jnp.searchsorted(rank, which), src.shape[0] - 1)
-    reach2 = problem.cbar2 * problem.noise_bound**2
-
-    def further(turn: Array, pivot: Array) -> Array:
-        moved = pose.scale * so3.rotate(turn, src - src[pivot]) + dst[pivot]
-        agree = mask & (jnp.sum((dst - moved) ** 2, axis=1) <= reach2)
-        return jnp.sum(agree, dtype=jnp.int32) - mask[pivot].astype(jnp.int32)
-
-    high = lax.Precision.HIGHEST
-    turns = jnp.einsum("kij,jl->kil", jnp.asarray(TURNS, src.dtype), pose.rotation, precision=high)
-    return jax.vmap(further)(turns, pivots)
+    # Component by component: pairs of turns and matches are met in one pass and never stored.
+    which = jnp.arange(len(TURNS), dtype=jnp.int32) % jnp.maximum(jnp.sum(inliers, dtype=jnp.int32), 1)
+    pivots = bits.listed(inliers)[which]
+    turns = jnp.sum(jnp.asarray(TURNS, src.dtype)[:, :, :, None] * pose.rotation, axis=2)
+    a, b = src[pivots], dst[pivots]
+    residual2 = jnp.zeros((), src.dtype)
+    for i in range(3):
+        moved = sum(turns[:, i, j, None] * (src[:, j] - a[:, j, None]) for j in range(3))
+        residual2 += (dst[:, i] - b[:, i, None] - pose.scale * moved) ** 2
+    agree = (residual2 <= problem.cbar2 * problem.noise_bound**2) & mask
+    return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
 
 
 def _even_rotations(count: int, smallest_angle: float) -> np.ndarray:
@@ -158,6 +183,10 @@ def _even_rotations(count: int, smallest_angle: float) -> np.ndarray:
     rotations = so3.rotation_from_quat(np.stack(quats, axis=1))
     return rotations[so3.rotation_angle(rotations) > smallest_angle]
 
+
+# Odd numbers that mix the bits of six words, and of their sum.
+HASH = np.array([0x9E3779B1, 0x85EBCA6B, 0xC2B2AE35, 0x27D4EB2F, 0x165667B1, 0x7FEB352D], np.uint32)[:, None]
+HASH = np.concatenate([HASH, np.roll(HASH, 1)], axis=1)
 
 # Turns away from a candidate: large enough that its own inliers do not come along.
 TURNS = _even_rotations(70, np.deg2rad(45.0))

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -63,42 +64,64 @@ def vote(
     reach = jnp.sqrt(cbar2) * jnp.where(voters, bounds, 1)
     weights = jnp.where(voters, 1 / jnp.where(voters, bounds, 1) ** 2, 0)
     # Centred at the weighted mean: the running sums then hold the smallest numbers they can.
-    total = jnp.sum(weights)
-    centre = jnp.sum(jnp.where(voters, weights * values, 0)) / jnp.where(total > 0, total, 1)
+    centre = _mean(weights, jnp.where(voters, values, 0))
     offsets = jnp.where(voters, values - centre, 0)
 
     ends = jnp.concatenate([offsets - reach, offsets + reach])
     ends = jnp.where(jnp.concatenate([voters, voters]), ends, jnp.inf)
     order = _argsort(ends)
     entering = order < k
-    who = jnp.where(entering, order, order - k)
     sign = jnp.where(entering, 1, -1).astype(dtype)
-    moments = jnp.stack([weights, weights * offsets, weights * offsets**2, voters.astype(dtype)], axis=1)
-    sums = jnp.cumsum(moments[who] * sign[:, None], axis=0)
+    who = jnp.where(entering, order, order - k)
+    moments = jnp.stack([weights, weights * offsets, weights * offsets**2, voters.astype(dtype)])
+    mass, first, second, size = _running_sums(moments[:, who] * sign)
 
     # Between two ends the consensus set is constant. Where ends meet within rounding there is no
     # room to stand in, so such sets count only if no other does.
     begin = ends[order]
     until = jnp.concatenate([begin[1:], begin[-1:]])
-    size = sums[:, 3]
-    means = sums[:, 1] / jnp.where(sums[:, 0] > 0, sums[:, 0], 1)
-    allowed = (size > 0.5) & (sums[:, 0] > 0)
+    means = first / jnp.where(mass > 0, mass, 1)
+    allowed = (size > 0.5) & (mass > 0)
     allowed &= (means + centre >= interval[0]) & (means + centre <= interval[1])
     wide = allowed & (until - begin > 8 * jnp.finfo(dtype).eps * (jnp.abs(begin) + jnp.abs(centre)))
     allowed = jnp.where(jnp.any(wide), wide, allowed)
     found = jnp.any(allowed)
     if criterion == "consensus":
         allowed &= size > jnp.max(jnp.where(allowed, size, 0)) - 0.5
-    costs = sums[:, 2] - sums[:, 1] * means - cbar2 * size  # relative to all being outliers
+    costs = second - first * means - cbar2 * size  # relative to all being outliers
     best = _first_smallest(jnp.where(allowed, costs, jnp.inf))
     witness = 0.5 * (begin[best] + until[best])
     members = voters & (jnp.abs(witness - offsets) <= reach) & found
     # Afresh from the members: the running sums carry an error of about 1e-12 of the total cost.
-    chosen = jnp.where(members, weights, 0)
-    mass = jnp.sum(chosen)
-    estimate = jnp.sum(chosen * offsets) / jnp.where(mass > 0, mass, 1)
+    estimate = _mean(jnp.where(members, weights, 0), offsets)
     estimate, witness = (jnp.where(found, x + centre, 0) for x in (estimate, witness))
     return Vote(estimate, witness, members)
+
+
+def _mean(weights: Float[Array, " k"], values: Float[Array, " k"]) -> Float[Array, ""]:
+    """The weighted mean, 0 of no weight; both sums in one product."""
+    both = jnp.stack([jnp.ones_like(values), values])
+    total, above = jnp.matmul(both, weights, precision=lax.Precision.HIGHEST)
+    return above / jnp.where(total > 0, total, 1)
+
+
+def _running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
+    """Cumulative sums along each row, in products with triangles of ones.
+
+    The rows are cut in pieces, summed inside each, and the totals of the pieces are summed the
+    same way. XLA would make log m passes of ``cumsum`` on the CPU, and compile each.
+    """
+    c, m = x.shape
+    piece = 64
+    if m <= piece:
+        return jnp.matmul(x, np.triu(np.ones((m, m))).astype(x.dtype), precision=lax.Precision.HIGHEST)
+    count = -(-m // piece)
+    pieces = jnp.pad(x, ((0, 0), (0, count * piece - m))).reshape(c, count, piece)
+    triangle = np.triu(np.ones((piece, piece))).astype(x.dtype)
+    inside = jnp.matmul(pieces, triangle, precision=lax.Precision.HIGHEST)
+    totals = inside[:, :, -1]
+    before = _running_sums(totals) - totals
+    return (inside + before[:, :, None]).reshape(c, count * piece)[:, :m]
 
 
 def _first_smallest(x: Float[Array, " m"]) -> Int[Array, ""]:
