@@ -1,7 +1,8 @@
 """The command line: ``teaser-jax register MATCHES`` and ``teaser-jax demo``.
 
 Exit codes: 0, the answer can be trusted; 1, there is no trustworthy answer and the status says
-why; 2, bad input, with one line on stderr that says what is wrong and what to do.
+why; 2, bad input, with one line on stderr that says what is wrong and what to do. With 2 no file
+has changed.
 """
 
 from __future__ import annotations
@@ -10,18 +11,21 @@ import argparse
 import json
 import math
 import os
+import re
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 import teaser_jax as tj
-from teaser_jax.files import FileError, one_line, read_matches, write_pose
+from teaser_jax.files import KNOWN, FileError, Matches, one_line, read_matches, whole, write_pose
 
 OK, UNTRUSTED, BAD_INPUT = 0, 1, 2
+PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")  # what matplotlib writes without further programs
 SIGINT, SIGPIPE = 130, 141  # as shells report a program that these signals end
 
 
@@ -68,40 +72,43 @@ def _parser() -> argparse.ArgumentParser:
     register.set_defaults(run=_register)
     register.add_argument(
         "matches", metavar="MATCHES", type=Path,
-        help=".npz with arrays src and dst, or text or CSV with six columns",
+        help=".npz with arrays src and dst, maybe also noise_bound, scale, cbar2, mask, confidence, pairs; "
+        "or text or CSV with six columns",
     )  # fmt: skip
+    # Options that are not given stay absent: then the file speaks, then the defaults of tj.register.
     register.add_argument(
-        "--noise-bound", type=float, metavar="B",
+        "--noise-bound", type=float, default=argparse.SUPPRESS, metavar="B",
         help="largest error of a right match, in the unit of the points (default: noise_bound in the file)",
     )  # fmt: skip
     register.add_argument(
-        "--scale",
-        type=_scale,
-        default=1.0,
-        metavar="S|estimate",
-        help="the known scale (default: 1), or estimate it",
-    )
+        "--scale", type=_scale, default=argparse.SUPPRESS, metavar="S|estimate",
+        help="the known scale (default: scale in the file, or 1), or the word estimate",
+    )  # fmt: skip
     register.add_argument(
-        "--cbar2", type=float, default=1.0, metavar="C", help="truncation of the cost (default: 1)"
-    )
+        "--cbar2", type=float, default=argparse.SUPPRESS, metavar="C",
+        help="truncation of the cost (default: cbar2 in the file, or 1)",
+    )  # fmt: skip
     register.add_argument(
         "--clique", choices=("exact", "greedy", "networkx", "none"), default=tj.Settings().clique,
         help="how to prune wrong matches (default: exact)",
     )  # fmt: skip
     register.add_argument("--json", action="store_true", help="print the answer as JSON")
     register.add_argument(
-        "--plot", type=Path, metavar="PNG", help="write a picture of the answer, good or bad"
-    )
+        "--plot", type=_picture, metavar="PNG",
+        help="write a picture of the answer, good or bad: .png, .pdf, .svg or .jpg",
+    )  # fmt: skip
     register.add_argument(
-        "-o", "--output", type=Path, metavar="TXT",
-        help="write T_dst_src, 4 x 4; unless the answer can be trusted there is no such file afterwards",
+        "-o", "--output", type=_output, metavar="TXT",
+        help="write T_dst_src, 4 x 4; if the answer cannot be trusted, an older file is removed instead",
     )  # fmt: skip
 
     demo = commands.add_parser(
         "demo", help="register 1000 matches of which 950 are wrong, and draw the answer"
     )
     demo.set_defaults(run=_demo)
-    demo.add_argument("--plot", type=Path, default=Path("demo.png"), metavar="PNG", help="default: demo.png")
+    demo.add_argument(
+        "--plot", type=_picture, default=Path("demo.png"), metavar="PNG", help="default: demo.png"
+    )
     demo.add_argument("--seed", type=_seed, default=0, help="default: 0")
     return parser
 
@@ -119,34 +126,36 @@ def _seed(text: str) -> int:
     return int(text)
 
 
+def _output(text: str) -> Path:
+    if text == "-":
+        raise argparse.ArgumentTypeError("- is not understood as standard output: name a file")
+    return Path(text)
+
+
+def _picture(text: str) -> Path:
+    path = _output(text)
+    if path.suffix.lower() not in PICTURES:
+        kinds = ", ".join(PICTURES[:-1])
+        raise argparse.ArgumentTypeError(f"{text}: unknown kind of picture: end the name in one of {kinds}")
+    return path
+
+
 def _register(arguments: argparse.Namespace) -> int:
     source, output, plot = arguments.matches, arguments.output, arguments.plot
-    for path in (output, plot):
-        _check_writable(path, source)
-    if plot is not None:
-        _check_picture(plot)
-    if output is not None and output == plot:
-        raise BadInput(f"{output}: is named for the pose and for the picture: name two files")
-    # A file of an earlier run must not pass for this run's answer.
-    _remove(output)
+    _check_places(source, output, plot)
     matches = read_matches(source)
-    known = dict(matches.known)
-    if arguments.noise_bound is not None:
-        known["noise_bound"] = arguments.noise_bound
+    known = {**matches.known, **{name: value for name, value in vars(arguments).items() if name in KNOWN}}
     if "noise_bound" not in known:
         raise BadInput(
             "--noise-bound is missing: give the largest error of a right match, in the unit of the points"
         )
     start = time.perf_counter()
-    result = _answer(source, matches.src, matches.dst, arguments, known)
+    result = _answer(source, matches, tj.Settings(clique=arguments.clique), known)
     seconds = time.perf_counter() - start
 
-    # The picture first, then the pose, then the words: whatever fails, nothing that counts is out yet.
-    if plot is not None:
-        _draw(plot, matches.src, matches.dst, result)
-    if output is not None and result.ok:
-        _written(output, lambda: write_pose(output, result.pose))
-    elif output is not None:
+    # The words come last: whatever fails before, nothing that counts is out yet.
+    _write(result, matches, output, plot)
+    if output is not None and not result.ok:
         print(f"teaser-jax: {output} not written: {result.status.name}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(_report(result, matches.truth, seconds), allow_nan=False))
@@ -157,20 +166,36 @@ def _register(arguments: argparse.Namespace) -> int:
     return OK if result.ok else UNTRUSTED
 
 
-def _answer(
-    path: Path, src: Any, dst: Any, arguments: argparse.Namespace, known: dict[str, Any]
-) -> tj.Registration:
-    settings = tj.Settings(clique=arguments.clique)
+def _answer(path: Path, matches: Matches, settings: tj.Settings, known: dict[str, Any]) -> tj.Registration:
     try:
-        return tj.register(src, dst, scale=arguments.scale, cbar2=arguments.cbar2, settings=settings, **known)
+        return tj.register(matches.src, matches.dst, settings=settings, **known)
     except ValueError as error:
         raise BadInput(f"{path}: {error}") from error
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+        exhausted = re.search("out of memory|RESOURCE_EXHAUSTED", str(error), re.IGNORECASE)
+        if not (exhausted or isinstance(error, MemoryError)):
             raise
-        raise BadInput(
-            f"{path}: {len(src)} matches need more memory than there is: give fewer, the best ones first"
-        ) from error
+        # A MemoryError of register says what to do; those of Python, numpy and XLA do not.
+        advice = str(error) if type(error) is MemoryError else ""
+        too_many = f"{len(matches.src)} matches need more memory than there is: give fewer, the best first"
+        raise BadInput(f"{path}: {advice or too_many}") from error
+
+
+def _write(result: tj.Registration, matches: Matches, output: Path | None, plot: Path | None) -> None:
+    """The picture and the pose, or neither if one of them fails.
+
+    A pose of an earlier run must not pass for this run's answer: it goes if there is none.
+    """
+    with ExitStack() as until_all_is_well:
+        if plot is not None:
+            partial = until_all_is_well.enter_context(_writing(plot))
+            _draw(partial, matches.src, matches.dst, result)
+        if output is not None:
+            with _named(output):
+                if result.ok:
+                    write_pose(output, result.pose)
+                else:
+                    output.unlink(missing_ok=True)
 
 
 def _demo(arguments: argparse.Namespace) -> int:
@@ -188,11 +213,12 @@ def _demo(arguments: argparse.Namespace) -> int:
     )
     print(f"Time of each stage\n{profile}\n")
     try:
-        _check_picture(arguments.plot)
+        _check_matplotlib()
     except BadInput as error:
         print(f"No picture: {error}.", file=sys.stderr)
     else:
-        _draw(arguments.plot, problem.src, problem.dst, result)
+        with _writing(arguments.plot) as partial:
+            _draw(partial, problem.src, problem.dst, result)
         print(f"Picture: {arguments.plot}")
     return OK if result.ok else UNTRUSTED
 
@@ -254,20 +280,39 @@ def _plain(values: Any) -> Any:
 def _draw(path: Path, src: Any, dst: Any, result: tj.Registration) -> None:
     from teaser_jax.plots import plot_registration
 
-    _written(path, lambda: plot_registration(src, dst, result).savefig(path))
+    plot_registration(src, dst, result).savefig(path)
 
 
-def _written(path: Path, write: Callable[[], object]) -> None:
+@contextmanager
+def _writing(path: Path) -> Iterator[Path]:
+    with _named(path), whole(path) as partial:
+        yield partial
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Whatever keeps the file from being written is said in one line."""
     try:
-        write()
+        yield
     except OSError as error:
         raise BadInput(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _check_places(source: Path, output: Path | None, plot: Path | None) -> None:
+    for path in (output, plot):
+        _check_writable(path, source)
+    if plot is not None:
+        _check_matplotlib()
+    if output is not None and plot is not None and os.path.realpath(output) == os.path.realpath(plot):
+        raise BadInput(f"{output}: is named for the pose and for the picture: name two files")
 
 
 def _check_writable(path: Path | None, source: Path | None) -> None:
     """Say before the work, not after it, that its answer has no place to go."""
     if path is None:
         return
+    with _named(path):
+        path.exists()  # raises if the name is too long
     folder = path.parent
     if path.is_dir():
         raise BadInput(f"{path}: is a folder: name a file to write")
@@ -275,25 +320,17 @@ def _check_writable(path: Path | None, source: Path | None) -> None:
         raise BadInput(f"{path}: is no ordinary file: name one to write")
     if not folder.is_dir():
         raise BadInput(f"{path}: the folder {folder} does not exist: make it first")
-    if not os.access(path if path.exists() else folder, os.W_OK):
+    if not all(os.access(place, os.W_OK) for place in (folder, path) if place.exists()):
         raise BadInput(f"{path}: cannot be written: no permission")
     if source is not None and path.exists() and source.exists() and path.samefile(source):
         raise BadInput(f"{path}: is the file of matches: name another one to write")
 
 
-def _check_picture(path: Path) -> None:
+def _check_matplotlib() -> None:
     try:
-        from matplotlib.figure import Figure
+        import matplotlib.figure  # noqa: F401
     except ImportError:
         raise BadInput("pictures need matplotlib: pip install 'teaser-jax[viz]'") from None
-    kinds = Figure().canvas.get_supported_filetypes()
-    if path.suffix.lower().lstrip(".") not in kinds:
-        raise BadInput(f"{path}: unknown kind of picture: end the name in .png, .pdf or .svg")
-
-
-def _remove(path: Path | None) -> None:
-    if path is not None:
-        _written(path, lambda: path.unlink(missing_ok=True))
 
 
 if __name__ == "__main__":

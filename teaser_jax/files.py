@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -14,6 +15,9 @@ from jaxtyping import Float
 from teaser_jax.types import Pose
 
 TEXT = (".txt", ".csv", ".tsv", ".dat", ".xyz")
+KNOWN = ("noise_bound", "scale", "cbar2", "mask", "confidence", "pairs")
+ZIP = (b"PK\x03\x04", b"PK\x05\x06")  # how archives begin, full and empty ones
+PANDAS_HEADER = ["0", "1", "2", "3", "4", "5"]  # the column names of a table that was given none
 
 
 class FileError(ValueError):
@@ -26,7 +30,7 @@ class Matches:
 
     Attributes:
         src, dst: (n, 3) matched points, row i with row i.
-        known: Further arguments of ``register``: noise_bound, mask, confidence, pairs.
+        known: Further arguments of ``register``, those of ``KNOWN`` that the file holds.
         truth: The pose to compare with, from ``T_dst_src``.
     """
 
@@ -39,23 +43,24 @@ class Matches:
 def read_matches(path: str | PathLike[str]) -> Matches:
     """Matches from ``.npz`` (arrays ``src`` and ``dst``) or text (six columns).
 
-    An archive may also hold ``noise_bound``, ``mask``, ``confidence``, ``pairs`` and ``T_dst_src``.
-    Text has a row for each match, x y z of the source point, then of the target point, separated
-    by white space, commas, semicolons, tabs or bars; one line of column names and ``#`` comments
-    are skipped. The points are checked by ``register``.
+    An archive may also hold ``noise_bound``, ``scale``, ``cbar2``, ``mask``, ``confidence``,
+    ``pairs`` and ``T_dst_src``. Text has a row for each match, x y z of the source point, then of
+    the target point, separated by white space, commas, semicolons, tabs or bars; one line of
+    column names (also 0 to 5, which pandas writes) and ``#`` comments are skipped. The points are
+    checked by ``register``.
 
     Raises:
         FileError: If there is no such file, or it is broken, or holds something else.
     """
     path = Path(path)
-    read = _read_text if path.suffix.lower() in TEXT else _read_npz
-    if read is _read_npz and path.suffix.lower() != ".npz":
-        known = ", ".join((".npz", *TEXT))
-        raise FileError(f"{path}: unknown extension '{path.suffix}': give matches as one of {known}.")
+    readers = {".npz": _read_npz, **dict.fromkeys(TEXT, _read_text)}
     try:
         if path.is_dir():
             raise FileError(f"{path}: is a folder: name the file of matches in it.")
-        return read(path)
+        if path.suffix.lower() not in readers:
+            kinds = ", ".join(readers)
+            raise FileError(f"{path}: unknown extension '{path.suffix}': give matches as one of {kinds}.")
+        return readers[path.suffix.lower()](path)
     except FileNotFoundError:
         raise FileError(f"{path}: no such file.") from None
     except OSError as error:
@@ -67,10 +72,16 @@ def write_pose(path: str | PathLike[str], pose: Pose) -> None:
 
     The file appears whole or not at all. Raises OSError if it cannot be written.
     """
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
+    with whole(Path(path)) as partial:
         np.savetxt(partial, pose.matrix, fmt="%.17g")
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A place to write, which becomes ``path`` at the end; after a failure ``path`` is as before."""
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
@@ -92,8 +103,7 @@ def _read_npz(path: Path) -> Matches:
                 f"{path}: holds no array '{name}' (found: {one_line(found, 80)}): "
                 "save one with numpy.savez(path, src=src, dst=dst)."
             )
-    names = ("noise_bound", "mask", "confidence", "pairs")
-    known = {name: arrays[name] for name in names if name in arrays}
+    known = {name: arrays[name] for name in KNOWN if name in arrays}
     truth = None
     if "T_dst_src" in arrays:
         truth = _guarded(path, "T_dst_src is no pose", lambda: Pose.from_matrix(_real(arrays["T_dst_src"])))
@@ -103,9 +113,13 @@ def _read_npz(path: Path) -> Matches:
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     # numpy closes only files that it did not open; pickled objects would run code from the file.
     with path.open("rb") as file:
-        archive = np.load(file, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+        start = file.read(6)
+        if start == b"\x93NUMPY":
             raise ValueError("one array without a name")
+        if not start.startswith(ZIP):  # numpy would take it for a pickle and advise to trust it
+            raise ValueError("it does not begin as a zip file does")
+        file.seek(0)
+        archive = np.load(file, allow_pickle=False)
         return {name: archive[name] for name in archive.files}
 
 
@@ -114,23 +128,36 @@ def _read_text(path: Path) -> Matches:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise FileError(f"{path}: is not text: expected six columns of numbers.") from None
-    rows = [line for line in lines if line.split("#")[0].strip()]
-    delimiter = next((d for d in ";,\t|" if rows and d in rows[0]), None)
-    if rows and not any(_is_number(field) for field in rows[0].split(delimiter)):
-        rows = rows[1:]  # column names; a first row that is partly numbers is an error instead
+    numbered = ((number, line.split("#")[0]) for number, line in enumerate(lines, 1))
+    rows = [(number, line) for number, line in numbered if line.strip()]
+    delimiter = next((d for d in ";,\t|" if rows and d in rows[0][1]), None)
+    if rows and _is_header(_fields(rows[0][1], delimiter)):
+        rows = rows[1:]
     if not rows:
         raise FileError(f"{path}: holds no match: expected six numbers a row.")
-    table = _guarded(
-        path,
-        "is no table of numbers",
-        lambda: np.loadtxt(rows, delimiter=delimiter, comments="#", quotechar='"', ndmin=2),
-    )
-    if table.shape[1] != 6:
-        raise FileError(
-            f"{path}: has {table.shape[1]} columns: expected six, x y z of the source point, "
-            "then of the target."
-        )
+    table = np.array([_match(f"{path}: line {number}", _fields(line, delimiter)) for number, line in rows])
     return Matches(table[:, :3], table[:, 3:], {})
+
+
+def _fields(line: str, delimiter: str | None) -> list[str]:
+    return [field.strip().strip('"') for field in line.split(delimiter)]
+
+
+def _is_header(fields: list[str]) -> bool:
+    """Column names; a first row that is partly numbers is an error instead."""
+    return fields == PANDAS_HEADER or not any(_is_number(field) for field in fields)
+
+
+def _match(where: str, fields: list[str]) -> list[float]:
+    if len(fields) != 6:
+        raise FileError(
+            f"{where} has {len(fields)} columns: expected six, x y z of the source point, then of the target."
+        )
+    try:
+        return [float(field) for field in fields]
+    except ValueError:
+        wrong = next(field for field in fields if not _is_number(field))
+        raise FileError(f"{where} holds '{one_line(wrong, 40)}': expected six numbers.") from None
 
 
 def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
@@ -150,7 +177,7 @@ def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:
 
 def _is_number(field: str) -> bool:
     try:
-        float(field.strip().strip('"'))
+        float(field)
     except ValueError:
         return False
     return True

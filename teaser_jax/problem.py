@@ -33,7 +33,8 @@ def make_problem(
     rows that cannot be used (NaN, infinity, bounds not above 0) are left out while solving.
 
     Args:
-        src, dst: (n, 3) points, any real dtype; integers become floats.
+        src, dst: (n, 3) points, any real dtype; integers become floats, entries that a numpy
+            masked array hides become NaN.
         noise_bound: Largest error of a right match [length unit of the points], one number or (n,).
         scale: The known scale [-], or None: estimate it.
         cbar2: Truncation of the cost, c-bar squared [-].
@@ -63,7 +64,7 @@ def make_problem(
     mask = np.ones(n, bool) if mask is None else _mask(mask, n)
     pairs = None if pairs is None else _pairs(pairs, n)
     cbar2 = _scalar(cbar2, "cbar2")
-    scale = None if scale is None else _scalar(scale, "scale")
+    scale = None if scale is None else _scale(scale)
     _check_values(src, dst, noise_bound, mask, confidence, dtype)
 
     def ready(x: Any) -> jax.Array:
@@ -127,7 +128,11 @@ def is_traced(*values: Any) -> bool:
 
 def as_numpy(value: Any, name: str) -> np.ndarray:
     """A numpy view or copy of anything with ``__array__`` or ``__dlpack__``, or nested lists."""
+    if value is None:
+        raise ValueError(f"{name} is missing: None was given where numbers are needed.")
     try:
+        if isinstance(value, np.ma.MaskedArray):
+            return _filled(value)
         if hasattr(value, "__dlpack__") and not hasattr(value, "__array__"):
             return np.from_dlpack(value)
         return np.asarray(value)
@@ -138,22 +143,27 @@ def as_numpy(value: Any, name: str) -> np.ndarray:
         ) from error
 
 
-def _read(value: Any, name: str) -> Any:
+def _filled(array: np.ma.MaskedArray) -> np.ndarray:
+    """What is hidden must not come back as a number: it becomes NaN, or False among truth values."""
+    if not np.ma.is_masked(array):
+        return array.data
+    if array.dtype.kind == "b":
+        return array.filled(False)
+    return np.ma.filled(array.astype(np.float64) if array.dtype.kind in "iu" else array, np.nan)
+
+
+def _array(value: Any, name: str) -> Any:
+    return value if is_traced(value) else as_numpy(value, name)
+
+
+def _floats(value: Any, name: str) -> Any:
     """Real numbers as a tracer, or as a numpy array in the machine's own byte order."""
-    if is_traced(value):
-        array = value
-    else:
-        array = as_numpy(value, name)
+    array = _array(value, name)
     if array.dtype.kind not in "fiub" and array.dtype != jnp.bfloat16:
         raise ValueError(
             f"{name} has dtype {array.dtype}: expected real numbers. Convert it, for instance with "
             "numpy.asarray(x, dtype=float)."
         )
-    return array
-
-
-def _floats(value: Any, name: str) -> Any:
-    array = _read(value, name)
     if array.dtype.kind == "b":
         raise ValueError(f"{name} holds truth values: expected real numbers.")
     if is_traced(array):
@@ -166,7 +176,9 @@ def _points(value: Any, name: str) -> Any:
     array = _floats(value, name)
     shape = array.shape
     if 0 in shape:
-        raise ValueError(f"{name} is empty (shape {shape}): give at least 3 matches (rows).")
+        raise ValueError(
+            f"{name} is empty (shape {shape}): an answer that can be trusted needs at least 4 matches (rows)."
+        )
     if len(shape) == 2 and shape[0] == 3 and shape[1] != 3:
         raise ValueError(f"{name} has shape {shape}: points are rows, so pass {name}.T of shape (n, 3).")
     if len(shape) != 2 or shape[1] != 3:
@@ -190,12 +202,20 @@ def _scalar(value: Any, name: str) -> Any:
     return array
 
 
+def _scale(value: Any) -> Any:
+    array = _array(value, "scale")
+    if array.dtype.kind in "US":
+        raise ValueError(f"scale is the text '{array}': give a number, or pass scale=None to estimate it.")
+    return _scalar(array, "scale")
+
+
 def _mask(value: Any, n: int) -> Any:
-    array = _read(value, "mask")
+    array = _array(value, "mask")
     if array.shape != (n,) or array.dtype.kind != "b":
+        convertible = array.shape == (n,) and array.dtype.kind in "iuf"
         raise ValueError(
             f"mask has shape {array.shape} and dtype {array.dtype}: expected ({n},) truth values, "
-            "one a match."
+            f"one a match{'; pass mask.astype(bool)' if convertible else ''}."
         )
     return array
 
@@ -206,13 +226,15 @@ def _pairs(value: Any, n: int) -> Any:
         if not all(isinstance(x, (int, np.integer)) for x in value.ravel()):
             raise ValueError("the nodes of the pairs graph must be row numbers (integers).")
         value = value.astype(np.int64)
-    array = _read(value, "pairs")
+    array = _array(value, "pairs")
+    if array.shape[:1] == (0,):
+        raise ValueError("pairs is empty, so that no matches are compared: pass pairs=None to compare all.")
     if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
         raise ValueError(
             f"pairs has shape {array.shape} and dtype {array.dtype}: expected (m, 2) integers, "
             "the row numbers of each pair."
         )
-    if not is_traced(array) and array.size:
+    if not is_traced(array):
         low, high = int(np.min(array)), int(np.max(array))
         if low < 0 or high >= n:
             raise ValueError(f"pairs refer to rows {low} to {high}: rows run from 0 to {n - 1}.")
@@ -249,8 +271,8 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
             )
         rounding = float(kind.eps) * largest
         if rounding > 0.01 * bound:
+            wider = "" if dtype == jnp.float64 else ", or use register(), which does that in float64"
             raise ValueError(
                 f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % "
-                f"of noise_bound {bound:.3g}. Subtract a common origin from each cloud first, or use "
-                "register(), which does that in float64."
+                f"of noise_bound {bound:.3g}. Subtract a common origin from each cloud first{wider}."
             )

@@ -65,8 +65,10 @@ def profile(
     above the time of one ``register`` call, in which neighbours are fused.
 
     Raises:
-        ValueError: As ``register``.
+        ValueError: As ``register``, and if ``repeats`` is below 1.
     """
+    if repeats < 1:
+        raise ValueError(f"repeats is {repeats}: time each stage at least once, after its first call.")
     problem = host_problem(src, dst, **known)
     cold: dict[str, float] = {}
     warm: dict[str, list[float]] = {}

@@ -90,6 +90,20 @@ def test_text_and_bounds_from_a_file_give_the_same_answer(tmp_path, small, solve
         np.testing.assert_allclose(matrix, solved.pose.matrix, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["scale", "cbar2"])
+def test_options_win_over_the_file_and_the_file_over_the_defaults(
+    tmp_path, small, solved, capsys, monkeypatch, name
+):
+    received = []
+    monkeypatch.setattr(tj, "register", lambda *_, settings, **known: received.append(known) or solved)
+    plain, full = tmp_path / "plain.npz", tmp_path / "full.npz"
+    np.savez(plain, src=small.src, dst=small.dst)
+    np.savez(full, src=small.src, dst=small.dst, **{name: 2.0})
+    for path, *options in ((plain,), (full,), (full, f"--{name}", "3")):
+        assert cli.main(["register", str(path), "--noise-bound", "1", *options]) == 0
+    assert received == [{"noise_bound": 1}, {"noise_bound": 1, name: 2}, {"noise_bound": 1, name: 3}]
+
+
 def test_an_estimated_scale(tmp_path, capsys):
     problem = tj.synthetic.random_problem(1, n=32, outlier_rate=0.25, scale=3.0)
     path = tmp_path / "m.npz"
@@ -115,22 +129,28 @@ def test_no_trustworthy_answer_leaves_no_pose_behind(wrong, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("draws", [True, False])
-def test_nothing_is_said_when_something_cannot_be_written(matches, tmp_path, capsys, monkeypatch, draws):
+def test_nothing_is_said_or_changed_when_something_cannot_be_written(
+    matches, tmp_path, capsys, monkeypatch, draws
+):
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(*((plots, "plot_registration", full) if draws else (cli, "write_pose", full)))
     output, plot = tmp_path / "T.txt", tmp_path / "p.png"
+    for path in (output, plot):
+        path.write_text("of an earlier run")
     arguments = ["register", matches, "--noise-bound", 0.0554, "-o", output, "--plot", plot]
     assert "cannot be written: No space left on device" in bad_input(capsys, *arguments)
-    assert not output.exists()
+    assert {path.read_text() for path in (output, plot)} == {"of an earlier run"}
+    assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_bad_input_leaves_no_pose_behind_either(tmp_path, capsys):
+@pytest.mark.parametrize(("name", "bound"), [("none.npz", 1), ("matches.npz", -1)])
+def test_bad_input_leaves_an_older_file_alone(matches, tmp_path, capsys, name, bound):
     output = tmp_path / "T.txt"
     output.write_text("the pose of an earlier run")
-    bad_input(capsys, "register", tmp_path / "none.npz", "--noise-bound", 1, "-o", output)
-    assert not output.exists()
+    bad_input(capsys, "register", tmp_path / name, "--noise-bound", bound, "-o", output)
+    assert output.read_text() == "the pose of an earlier run"
 
 
 @pytest.mark.parametrize(
@@ -154,19 +174,29 @@ def test_bad_input_leaves_no_pose_behind_either(tmp_path, capsys):
         (["register", "{m}", "--noise-bound", "1", "-o", "{d}"], "is a folder: name a file to write"),
         (["register", "{m}", "--noise-bound", "1", "-o", "{d}/no/T.txt"], "does not exist: make it first"),
         (["register", "{m}", "--noise-bound", "1", "-o", "{m}"], "is the file of matches"),
-        (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.bmp2"], "end the name in .png"),
+        (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.bmp2"], "end the name in one of .png"),
+        (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.pgf"], "end the name in one of .png"),
+        (["register", "{m}", "--noise-bound", "1", "--plot", "-"], "name a file"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "-"], "name a file"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "x" * 300], "cannot be written: File name too long"),
+        (["register", "{d}", "--noise-bound", "1"], "is a folder: name the file of matches in it"),
         (["register", "{m}", "--noise-bound", "1", "-o", "{null}"], "is no ordinary file"),
         (
             ["register", "{m}", "--noise-bound", "1", "-o", "{d}/a.png", "--plot", "{d}/a.png"],
             "name two files",
         ),
+        (
+            ["register", "{m}", "--noise-bound", "1", "-o", "{d}/a.png", "--plot", "{d}/../{n}/a.png"],
+            "name two files",
+        ),
         (["register", "{d}/none.npz", "--noise-bound", "1"], "no such file"),
         (["demo", "--plot", "{d}/no/demo.png"], "does not exist: make it first"),
+        (["demo", "--plot", "demo.pgf"], "end the name in one of .png"),
         (["demo", "--seed", "-1"], "-1 is no seed"),
     ],
 )
 def test_bad_arguments(matches, tmp_path, capsys, arguments, message):
-    filled = [a.format(m=matches, d=tmp_path, null=os.devnull) for a in arguments]
+    filled = [a.format(m=matches, d=tmp_path, n=tmp_path.name, null=os.devnull) for a in arguments]
     assert message in bad_input(capsys, *filled)
     assert matches.exists()
 
@@ -180,6 +210,7 @@ def test_bad_arguments(matches, tmp_path, capsys, arguments, message):
         (dict(src=np.array(["a"]), dst=np.array(["b"])), "src"),
         (dict(src=np.full((5, 3), np.nan), dst=np.zeros((5, 3))), "no row of src and dst is finite"),
         (dict(src=np.zeros((5, 3)), dst=np.zeros((5, 3)), mask=np.ones(4, bool)), "mask has shape (4,)"),
+        (dict(src=np.zeros((5, 3)), dst=np.zeros((5, 3)), cbar2=-1.0), "cbar2 is -1"),
     ],
 )
 def test_bad_arrays(tmp_path, capsys, arrays, message):
@@ -209,12 +240,21 @@ def test_any_arrays_end_in_an_exit_code(tmp_path, capsys, src, dst, bound):
         assert strictly(out)["ok"] is (code == 0)
 
 
-def test_memory_runs_out(matches, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError(), "32 matches need more memory"),
+        (MemoryError("pass pairs="), "pass pairs="),
+        (RuntimeError("Out of memory allocating 8 bytes"), "32 matches need more memory"),
+        (RuntimeError("RESOURCE_EXHAUSTED: no room"), "32 matches need more memory"),
+    ],
+)
+def test_memory_runs_out(matches, capsys, monkeypatch, error, message):
     def register(*_, **__):
-        raise MemoryError
+        raise error
 
     monkeypatch.setattr(tj, "register", register)
-    assert "32 matches need more memory" in bad_input(capsys, "register", matches, "--noise-bound", 1)
+    assert message in bad_input(capsys, "register", matches, "--noise-bound", 1)
 
 
 def test_a_bug_is_not_called_bad_input(matches, monkeypatch):

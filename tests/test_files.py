@@ -55,6 +55,7 @@ def complaint(path) -> str:
 def test_archives_hold_points_and_what_is_known(tmp_path):
     path = tmp_path / "m.npz"
     known = {"noise_bound": np.full(5, 0.1), "confidence": np.arange(5.0), "mask": np.ones(5, bool)}
+    known |= {"scale": 2.0, "cbar2": 0.5}
     np.savez(path, src=SRC, dst=DST, T_dst_src=POSE.matrix, something_else=1, **known)
     matches = read_matches(str(path))
     np.testing.assert_array_equal(matches.src, SRC)
@@ -83,10 +84,20 @@ def test_quotes_and_missing_numbers(tmp_path):
     np.testing.assert_array_equal(read_matches(path).src, [[1, 2, 3], [np.nan, 2, 3]])
 
 
+@pytest.mark.parametrize("header", ["0,1,2,3,4,5", '"0","1","2","3","4","5"'])
+def test_the_default_header_of_pandas_is_no_match(tmp_path, header):
+    path = tmp_path / "m.csv"
+    path.write_text(f"{header}\n0,1,2,3,4,5\n6,7,8,9,10,11\n")
+    np.testing.assert_array_equal(read_matches(path).src, [[0, 1, 2], [6, 7, 8]])
+    path.write_text("0.0,1,2,3,4,5\n")
+    assert len(read_matches(path).src) == 1
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("m.npz", b"", "is no .npz archive, or is broken"),
+        ("m.npz", b"1 2 3 4 5 6\n", "is no .npz archive, or is broken (it does not begin as a zip file"),
         ("m.npz", b"PK\x03\x04 and then nothing", "is no .npz archive, or is broken"),
         ("m.npz", WHOLE[:200], "is no .npz archive, or is broken"),
         ("m.npz", WHOLE[:-30], "is no .npz archive, or is broken"),
@@ -100,12 +111,12 @@ def test_quotes_and_missing_numbers(tmp_path):
         ("m.txt", b"# only\n\n# comments\n", "holds no match"),
         ("m.txt", b"x y z u v w\n", "holds no match"),
         ("m.txt", b"\xff\xfe\x00binary\x9f", "is not text"),
-        ("m.txt", b"1 2 3\n4 5 6\n", "has 3 columns: expected six"),
-        ("m.csv", b"1,2,3,4,5,6,7\n", "has 7 columns: expected six"),
-        ("m.csv", b"1,2,,3,4,5,6\n", "is no table of numbers"),
-        ("m.csv", b"1,2,3,4,5,6\n1,2,3\n", "is no table of numbers"),
-        ("m.csv", b"1,2,3,4,5,six\n", "is no table of numbers"),
-        ("m.csv", b"a,2,3,4,5,6\n1,2,3,4,5,6\n", "is no table of numbers"),
+        ("m.txt", b"1 2 3\n4 5 6\n", "line 1 has 3 columns: expected six"),
+        ("m.csv", b"1,2,3,4,5,6,7\n", "line 1 has 7 columns: expected six"),
+        ("m.csv", b"1,2,,4,5,6\n", "line 1 holds '': expected six numbers"),
+        ("m.csv", b"x,y,z,u,v,w\n# why\n\n1,2,3,4,5,6\n1,2,3\n", "line 5 has 3 columns: expected six"),
+        ("m.csv", b"1,2,3,4,5,6\n1,2,3,4,5,six\n", "line 2 holds 'six': expected six numbers"),
+        ("m.csv", b"a,2,3,4,5,6\n1,2,3,4,5,6\n", "line 1 holds 'a'"),
         ("m.ply", b"ply\n", "unknown extension '.ply'"),
         ("matches", b"1 2 3 4 5 6\n", "unknown extension ''"),
     ],
@@ -127,6 +138,7 @@ def test_no_file_and_no_file_but_a_folder(tmp_path):
     assert "no such file" in reason(tmp_path / "m.npz")
     (tmp_path / "f.npz").mkdir()
     assert "is a folder" in reason(tmp_path / "f.npz")
+    assert "is a folder" in reason(tmp_path)
     assert "cannot be read" in reason(tmp_path / ("x" * 300 + ".npz"))
 
 
