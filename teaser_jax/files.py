@@ -135,7 +135,15 @@ def _read_text(path: Path) -> Matches:
         rows = rows[1:]
     if not rows:
         raise FileError(f"{path}: holds no match: expected six numbers a row.")
-    table = np.array([_match(f"{path}: line {number}", _fields(line, delimiter)) for number, line in rows])
+    reason = ""
+    try:
+        table = np.loadtxt([line.replace('"', "") for _, line in rows], delimiter=delimiter, ndmin=2)
+    except ValueError as error:
+        table, reason = np.empty((0, 0)), str(error)
+    if table.shape[1] != 6:
+        for number, line in rows:
+            _check_line(f"{path}: line {number}", _fields(line, delimiter))
+        raise FileError(f"{path}: cannot be read ({one_line(reason)}): expected six numbers a row.")
     return Matches(table[:, :3], table[:, 3:], {})
 
 
@@ -148,16 +156,14 @@ def _is_header(fields: list[str]) -> bool:
     return fields == PANDAS_HEADER or not any(_is_number(field) for field in fields)
 
 
-def _match(where: str, fields: list[str]) -> list[float]:
+def _check_line(where: str, fields: list[str]) -> None:
     if len(fields) != 6:
         raise FileError(
             f"{where} has {len(fields)} columns: expected six, x y z of the source point, then of the target."
         )
-    try:
-        return [float(field) for field in fields]
-    except ValueError:
-        wrong = next(field for field in fields if not _is_number(field))
-        raise FileError(f"{where} holds '{one_line(wrong, 40)}': expected six numbers.") from None
+    for field in fields:
+        if not _is_number(field):
+            raise FileError(f"{where} holds '{one_line(field, 40)}': expected six numbers.")
 
 
 def _guarded(path: Path, what: str, read: Callable[[], Any]) -> Any:

@@ -50,7 +50,29 @@ def make_problem(
 
     Gradients: exact in ``src``, ``dst``, ``noise_bound``, ``scale`` and ``confidence``.
     """
-    # Everything concrete is read into numpy and checked there: under jit, jnp would trace it.
+    read = read_problem(
+        src, dst, noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
+        confidence=confidence, pairs=pairs,
+    )  # fmt: skip
+    return jax.tree.map(jnp.asarray, read)
+
+
+def read_problem(
+    src: Any,
+    dst: Any,
+    *,
+    dtype: Any = None,
+    noise_bound: Any,
+    scale: Any = 1.0,
+    cbar2: Any = 1.0,
+    mask: Any = None,
+    confidence: Any = None,
+    pairs: Any = None,
+) -> Problem:
+    """``make_problem`` with everything concrete left in numpy, in ``dtype`` (None: JAX's choice).
+
+    Under jit, jnp would trace what is read and checked here.
+    """
     src, dst = _points(src, "src"), _points(dst, "dst")
     if src.shape[0] != dst.shape[0]:
         raise ValueError(
@@ -58,7 +80,8 @@ def make_problem(
             "with row i of dst. Match the clouds first and index both with the matches."
         )
     n = src.shape[0]
-    dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
+    if dtype is None:
+        dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
     noise_bound = _numbers(noise_bound, "noise_bound", n)
     confidence = np.ones(n) if confidence is None else _numbers(confidence, "confidence", n)
     mask = np.ones(n, bool) if mask is None else _mask(mask, n)
@@ -67,12 +90,12 @@ def make_problem(
     scale = None if scale is None else _scale(scale)
     _check_values(src, dst, noise_bound, mask, confidence, dtype)
 
-    def ready(x: Any) -> jax.Array:
-        return jnp.asarray(x, dtype)
+    def ready(x: Any) -> Any:
+        return x.astype(dtype)
 
     return Problem(
-        ready(src), ready(dst), ready(noise_bound), ready(cbar2), jnp.asarray(mask), ready(confidence),
-        None if scale is None else ready(scale), None if pairs is None else jnp.asarray(pairs, jnp.int32),
+        ready(src), ready(dst), ready(noise_bound), ready(cbar2), mask, ready(confidence),
+        None if scale is None else ready(scale), None if pairs is None else pairs.astype(np.int32),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from teaser_jax import so3
-from teaser_jax.problem import as_numpy, is_traced, make_problem, pad_problem
+from teaser_jax.problem import is_traced, pad_problem, read_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
 from teaser_jax.stages.clique import Clique, clique_on_device, search_on_host
 from teaser_jax.stages.invariants import words
@@ -38,6 +38,9 @@ class Registration:
     def ok(self) -> bool:
         """Whether to trust the pose."""
         return self.status == Status.OK
+
+    def __bool__(self) -> bool:
+        return self.ok
 
     def __repr__(self) -> str:
         return summary(self)
@@ -77,8 +80,11 @@ def register(
     Raises:
         ValueError: Bad input, with what was received and what to do; also when called under jit,
             where ``solve`` is the function to use.
+        MemoryError: More matches than there is memory for.
     """
-    if is_traced(src, dst, noise_bound, scale, cbar2, mask, confidence, pairs):
+    if not isinstance(settings, Settings):
+        raise ValueError(f"settings is {settings!r}: expected teaser_jax.Settings(...).")
+    if is_traced(src, dst, noise_bound, scale, cbar2, mask, confidence, pairs, settings):
         raise ValueError(
             "register was called on traced values, inside jit, vmap or grad. It runs on the host: use "
             "teaser_jax.solve(teaser_jax.make_problem(...)) there."
@@ -87,23 +93,50 @@ def register(
         src, dst, noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
         confidence=confidence, pairs=pairs,
     )  # fmt: skip
+    _check_numbers(settings)
     centred, origins = centre(problem)
-    padded = to_bucket(centred)
+    try:
+        solution = _solved(to_bucket(centred), settings)
+    except jax.errors.JaxRuntimeError as error:
+        if "memory" not in str(error).lower() and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise MemoryError(
+            f"{len(problem.src)} matches need more memory than there is (n^2 bits for known scale, "
+            "n^2 numbers for a voted one): give fewer, the best ones first"
+        ) from error
+    return registration_of(solution, problem, origins)
+
+
+def _solved(problem: Problem, settings: Settings) -> Solution:
+    """Device, host, device; a call inside somebody's jit, on constants, is evaluated at once."""
     # The device never reads the budgets of the host: without them, new budgets compile nothing.
     on_device = replace(settings, clique_nodes=1, clique_seconds=0.0)
-    with jax.enable_x64(True):
-        graph, found = before_clique(padded, on_device)
-        clique = between(padded, graph, found, settings)
-        solution = jax.device_get(after_clique(padded, graph, clique, on_device))
-    return registration_of(solution, problem, origins)
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        graph, found = before_clique(problem, on_device)
+        clique = between(problem, graph, found, settings)
+        return jax.device_get(after_clique(problem, graph, clique, on_device))
+
+
+def _check_numbers(settings: Settings) -> None:
+    """What ``Settings`` cannot check itself, because JAX rebuilds it with placeholders for numbers."""
+    low, high = settings.scale_range if len(settings.scale_range) == 2 else (None, None)
+    numbers = {
+        "gnc_factor": (settings.gnc_factor, lambda x: 1 < x < np.inf, "a number above 1"),
+        "gnc_tolerance": (settings.gnc_tolerance, lambda x: 0 <= x < np.inf, "0 or a number above"),
+        "scale_range": (low, lambda x: 0 <= x < float(high), "(low, high) with 0 <= low < high"),
+    }
+    for name, (value, good, expected) in numbers.items():
+        try:
+            fine = good(float(value))
+        except (TypeError, ValueError):
+            fine = False
+        if not fine:
+            raise ValueError(f"Settings.{name} is {getattr(settings, name)!r}: expected {expected}.")
 
 
 def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
     """``make_problem`` in float64 numpy, from anything that can be read on the host."""
-    src, dst = as_numpy(src, "src"), as_numpy(dst, "dst")
-    with jax.enable_x64(True):
-        widened = [x.astype(np.float64) if x.dtype.kind in "fiu" else x for x in (src, dst)]
-        return jax.tree.map(np.asarray, make_problem(*widened, **known))
+    return read_problem(src, dst, dtype=np.dtype(np.float64), **known)
 
 
 def centre(problem: Problem) -> tuple[Problem, tuple[np.ndarray, np.ndarray]]:
@@ -128,7 +161,7 @@ def bucket(n: int) -> int:
 
 def to_bucket(problem: Problem) -> Problem:
     """The problem padded to its buckets of matches and pairs."""
-    m = None if problem.pairs is None else bucket(max(1, problem.pairs.shape[0]))
+    m = None if problem.pairs is None else bucket(problem.pairs.shape[0])
     return pad_problem(problem, bucket(problem.src.shape[0]), m)
 
 
@@ -200,7 +233,12 @@ def summary(result: Registration) -> str:
     n, inliers = len(result.inliers), int(result.inliers.sum())
     angle = np.degrees(so3.rotation_angle(result.pose.rotation))
     x, y, z = result.pose.translation
-    proof = "proved maximum" if s.clique_is_maximum else f"not proved, at most {int(s.clique_upper_bound)}"
+    proof = (
+        "proved maximum"
+        if s.clique_is_maximum
+        else "not proved maximum, "
+        f"at most {int(s.clique_upper_bound)} (see Settings.clique, clique_seconds, clique_nodes)"
+    )
     rows = [
         f"{'ok' if result.ok else 'NOT OK'}: {result.status.name}",
         f"  inliers      {inliers} of {n} matches"

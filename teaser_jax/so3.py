@@ -166,8 +166,8 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     References: Yang, Shi, Carlone, T-RO 2020, eq. (12) without truncation; Horn 1987.
     """
     left, right = _leading_axes(matrix)
-    axes = [left[0], left[1], _cross(left[0], left[1])], [right[0], right[1], _cross(right[0], right[1])]
-    return sum(u[:, None] * v[None] for u, v in zip(*axes, strict=True))
+    third = _cross(left[0], left[1])[:, None] * _cross(right[0], right[1])
+    return left[0][:, None] * right[0] + left[1][:, None] * right[1] + third
 
 
 @nearest_rotation.defjvp

@@ -129,7 +129,7 @@ def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings 
     clique_size = jnp.sum(clique.members, dtype=jnp.int32)
     status = judge(
         lax.stop_gradient(p), frozen_pose, selection.inliers, selection.clique, graph.edge_bits,
-        converged=converged, pruned=settings.clique != "none",
+        converged=converged, pruned=settings.clique != "none", scale_range=settings.scale_range,
     )  # fmt: skip
     return Solution(
         pose=pose,
@@ -284,8 +284,17 @@ def usable_rows(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
         & jnp.isfinite(problem.confidence)
     )
     usable = problem.mask & finite & (problem.noise_bound > 0) & (problem.confidence > 0)
+    # Without a truncation or a known scale that makes sense, no row can be used.
+    cbar2, scale = problem.cbar2, problem.scale
+    sensible = jnp.isfinite(cbar2) & (cbar2 > 0)
+    if scale is not None:
+        sensible &= jnp.isfinite(scale) & (scale > 0)
+        scale = jnp.where(sensible, scale, 1)
+    usable &= sensible
     cleaned = replace(
         problem,
+        cbar2=jnp.where(sensible, cbar2, 1),
+        scale=scale,
         src=jnp.where(usable[:, None], problem.src, 0),
         dst=jnp.where(usable[:, None], problem.dst, 0),
         noise_bound=jnp.where(usable, problem.noise_bound, 1),

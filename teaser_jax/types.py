@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass, field
 from functools import partial
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
@@ -114,7 +115,8 @@ class Settings:
             clique so far and a proved upper bound are returned.
         gnc_factor: Growth of the GNC control parameter each round [-].
         gnc_tolerance: Relative change of the GNC cost that counts as none [-].
-        scale_range: Search interval of an unknown scale [-].
+        scale_range: Search interval of an unknown scale [-]. The refined scale may leave it by two
+            parts in a hundred; an answer further away has no consensus.
     """
 
     clique: CliqueMethod = "exact"
@@ -137,16 +139,17 @@ class Settings:
                 allowed = ", ".join(repr(x) for x in get_args(kind))
                 raise ValueError(f"Settings.{name} is {getattr(self, name)!r}: expected one of {allowed}.")
         for name in ("gnc_iterations", "refine_iterations", "clique_nodes"):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) > 0):
-                raise ValueError(
-                    f"Settings.{name} is {getattr(self, name)!r}: expected a whole number above 0."
-                )
+            cap = getattr(self, name)
+            if isinstance(cap, bool) or not isinstance(cap, Integral) or cap <= 0:
+                raise ValueError(f"Settings.{name} is {cap!r}: expected a whole number above 0.")
         if isinstance(self.gnc_factor, float | int) and not self.gnc_factor > 1:
             raise ValueError(f"Settings.gnc_factor is {self.gnc_factor!r}: expected a number above 1.")
-        low, high = self.scale_range if isinstance(self.scale_range, tuple) else (None, None)
-        if isinstance(low, float | int) and isinstance(high, float | int) and not low < high:
+        if not isinstance(self.scale_range, tuple) or len(self.scale_range) != 2:
             raise ValueError(f"Settings.scale_range is {self.scale_range!r}: expected (low, high).")
-        if not self.clique_seconds >= 0:
+        low, high = self.scale_range
+        if isinstance(low, float | int) and isinstance(high, float | int) and not 0 <= low < high:
+            raise ValueError(f"Settings.scale_range is {self.scale_range!r}: expected 0 <= low < high.")
+        if not isinstance(self.clique_seconds, Real) or not self.clique_seconds >= 0:
             raise ValueError(
                 f"Settings.clique_seconds is {self.clique_seconds!r}: expected 0 or more seconds."
             )
@@ -271,7 +274,7 @@ class Selection:
     ],
     meta_fields=[],
 )  # fmt: skip
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Solution:
     """The answer of ``solve``. Finite even when ``status`` says that it failed.
 
@@ -301,3 +304,11 @@ class Solution:
     def ok(self) -> Bool[AnyArray, ""]:
         """Whether the pose can be trusted. A proof elsewhere never turns this true."""
         return self.status == Status.OK
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, jax.core.Tracer) or np.shape(self.status) != ():
+            return f"Solution(status={self.status!r}, inliers of shape {np.shape(self.inliers)})"
+        return (
+            f"Solution(status={Status(int(self.status)).name}, {int(np.sum(self.inliers))} of "
+            f"{np.shape(self.inliers)[-1]} matches, pose={self.pose!r})"
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 
 import jax
 import networkx as nx
@@ -215,3 +216,49 @@ def test_any_input_gives_an_error_or_a_finite_answer(data):
     for leaf in jax.tree.leaves(dataclasses.replace(found.solution, selection=None)):
         assert np.all(np.isfinite(leaf))
     assert not found.ok or found.inliers.sum() >= 3
+
+
+# --- misuse ---------------------------------------------------------------------------------------
+
+
+def test_a_result_is_as_true_as_its_ok(problem, result):
+    assert result
+    wrong = tj.register(problem.src, problem.dst[::-1], noise_bound=problem.noise_bound)
+    assert not wrong
+
+
+def test_on_constants_it_works_inside_jit(problem, result):
+    inside = lambda x: x * tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound).pose.scale
+    assert jax.jit(inside)(2.0) == pytest.approx(2 * float(result.pose.scale))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        lambda: {},
+        lambda: None,
+        lambda: tj.Settings(gnc_factor=None),
+        lambda: tj.Settings(gnc_factor=np.float32(0.5)),
+        lambda: tj.Settings(gnc_tolerance="x"),
+        lambda: tj.Settings(gnc_tolerance=float("nan")),
+        lambda: tj.Settings(scale_range=None),
+        lambda: tj.Settings(scale_range=(0.0,)),
+        lambda: tj.Settings(scale_range=(0.9, "x")),
+        lambda: tj.Settings(scale_range=(-5.0, -1.0)),
+        lambda: tj.Settings(clique_seconds=None),
+        lambda: tj.Settings(clique_nodes=True),
+        lambda: tj.Settings(clique="best"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(problem, settings):
+    with pytest.raises(ValueError, match=r"[Ss]ettings.*expected"):
+        tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound, settings=settings())
+
+
+def test_too_many_matches_are_a_memory_error_with_advice(problem, monkeypatch):
+    def exhausted(*_):
+        raise jax.errors.JaxRuntimeError("INTERNAL: Out of memory allocating 125112025088 bytes.")
+
+    monkeypatch.setattr(sys.modules["teaser_jax.register"], "before_clique", exhausted)
+    with pytest.raises(MemoryError, match="give fewer"):
+        tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound)

@@ -190,7 +190,7 @@ def test_the_complete_graph_is_the_list_of_all_pairs():
     i, j = pairs.T
 
     def both(rotation):
-        weigh = lambda r2: jnp.clip(2 - r2, 0, 1)
+        weigh = lambda r2: 1 / (1 + r2)
         complete = complete_tims(*map(jnp.asarray, (matches.src, matches.dst, bounds, mask)))
         listed = listed_tims(
             *map(jnp.asarray, (matches.src[j] - matches.src[i], matches.dst[j] - matches.dst[i])),

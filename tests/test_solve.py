@@ -444,3 +444,18 @@ def test_the_smallest_problems_end_finite(n, x64):
     solution = solve(pad_problem(problem, N))
     assert_finite(solution)
     assert (int(solution.status) == tj.Status.TOO_FEW_POINTS) == (n < 3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 0.0, -1.0])
+@pytest.mark.parametrize("name", ["scale", "cbar2"])
+def test_a_traced_scale_or_truncation_that_makes_no_sense_ends_finite(name, bad, x64):
+    problem = problem_of(matches_of(1), scale=1.3)
+    solution = solve(replace(problem, **{name: jnp.asarray(bad)}))
+    assert_finite(solution)
+    assert int(solution.status) == tj.Status.TOO_FEW_POINTS
+
+
+def test_a_solution_is_shown_in_a_line_or_two():
+    problem = problem_of(matches_of(1), scale=1.3)
+    assert "OK" in repr(solve(problem))
+    assert f"inliers of shape (2, {N})" in repr(solve_batch(tj.stack_problems([problem, problem])))

@@ -111,3 +111,56 @@ def test_inliers_that_huddle_count_as_chance(x64):
     pose = tj.Pose(np.eye(3), np.zeros(3), np.ones(()))
     counts = np.asarray(trust.chance_inliers(problem, pose, np.arange(n) < 40))
     assert counts.min() == 39
+
+
+# --- evidence that is none ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_copies_of_a_match_are_no_evidence(seed):
+    # Thirty wrong matches, each listed sixteen times: three of them that agree look like 48.
+    rng = np.random.default_rng(seed)
+    src, dst = (np.repeat(rng.uniform(-1, 1, (30, 3)), 16, axis=0) for _ in range(2))
+    assert status(src, dst, settings=tj.Settings(clique_seconds=1.0)) != tj.Status.OK
+
+
+def test_copies_do_no_harm_either():
+    problem = random_problem(2, n=50, outlier_rate=0.5)
+    twice = [np.concatenate([x, x]) for x in (problem.src, problem.dst)]
+    found = tj.register(*twice, noise_bound=problem.noise_bound)
+    assert found.ok
+    np.testing.assert_array_equal(found.inliers[:50], problem.inliers)
+
+
+@pytest.mark.parametrize("n", [1, 40, 500])
+def test_repeats_are_the_later_copies(n, x64):
+    rng = np.random.default_rng(n)
+    rows = rng.normal(size=(n, 6))[rng.integers(0, (n + 1) // 2, n)]
+    problem = tj.make_problem(rows[:, :3], rows[:, 3:], noise_bound=1.0)
+    found = np.asarray(trust.repeats(problem))
+    _, first = np.unique(rows, axis=0, return_index=True)
+    later = ~np.isin(np.arange(n), first)
+    assert not found[~later].any()
+    assert found.sum() >= 0.9 * later.sum()  # two in one slot hide each other's copies
+
+
+def test_a_pose_that_two_matches_hold_is_not_determined():
+    problem = random_problem(0, n=100, outlier_rate=0.5)
+    weights = np.full(100, 1e-12)
+    weights[np.flatnonzero(problem.inliers)[:2]] = 1
+    known = dict(noise_bound=problem.noise_bound)
+    assert status(problem.src, problem.dst, confidence=weights, **known) == tj.Status.DEGENERATE
+    # The unit of confidence does not matter.
+    assert status(problem.src, problem.dst, confidence=np.full(100, 1e-12), **known) == tj.Status.OK
+
+
+def test_a_scale_out_of_its_range_has_no_consensus():
+    problem = random_problem(0, n=100, outlier_rate=0.5)
+    known = dict(noise_bound=problem.noise_bound, scale=None)
+    for scale_range, expected in {
+        (0.9, 1.1): tj.Status.OK,
+        (1.2, 1.5): tj.Status.NO_CONSENSUS,
+        (2.0, 3.0): tj.Status.NO_CONSENSUS,
+    }.items():
+        settings = tj.Settings(scale_range=scale_range)
+        assert status(problem.src, problem.dst, settings=settings, **known) == expected

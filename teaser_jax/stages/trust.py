@@ -10,6 +10,7 @@ and wrong; ``benchmarks/trust.py`` measures what they are worth.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +28,8 @@ SMALLEST_TURN = np.deg2rad(20.0)
 # A true consensus falls apart in no pose: on real pairs 0.39 - 0.8 of the clique stays, of a
 # mirrored cloud 0 - 0.2 (0.3 where the noise bound is a sixth of the object).
 LEAST_SHARE_OF_CLIQUE = 0.25
+# How far refinement may carry a scale out of the range it was looked for in.
+SCALE_SLACK = 0.02
 # Poses by chance that are tolerated, as a natural logarithm: one in a hundred.
 LARGEST_LOG_FALSE_ALARMS = float(np.log(1e-2))
 
@@ -40,6 +43,7 @@ def judge(
     *,
     converged: Bool[Array, ""],
     pruned: bool = True,
+    scale_range: tuple[Any, Any] = (0.0, float("inf")),
 ) -> Int[Array, ""]:
     """The status of a pose: the first of the questions that it fails, or OK.
 
@@ -51,6 +55,7 @@ def judge(
         edge_bits: The consistency graph.
         converged: Whether every iteration settled.
         pruned: Whether ``clique`` is one.
+        scale_range: Where an unknown scale was looked for.
 
     Gradients: none; inputs must be stopped by the caller.
     """
@@ -67,12 +72,15 @@ def judge(
         if pruned
         else jnp.zeros((), bool)
     )
+    low, high = scale_range
+    lost = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
+    lost = lost if problem.scale is None else jnp.zeros((), bool)
     questions = (
         (jnp.sum(problem.mask) < 3, Status.TOO_FEW_POINTS),
         # Three matches that agree on their distances always make a pose: they are no evidence.
         ((members < 3) | (agreeing <= 3), Status.NO_CONSENSUS),
         (~is_determined(problem, pose, inliers), Status.DEGENERATE),
-        (few | (alarms > LARGEST_LOG_FALSE_ALARMS) | collapsed, Status.NO_CONSENSUS),
+        (few | lost | (alarms > LARGEST_LOG_FALSE_ALARMS) | collapsed, Status.NO_CONSENSUS),
         (~converged, Status.NOT_CONVERGED),
     )
     verdict = jnp.int32(Status.OK)
