@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from teaser_jax.register import (
     Registration,
@@ -16,6 +18,7 @@ from teaser_jax.register import (
     between,
     centre,
     device_clique,
+    edge_dtype,
     host_problem,
     registration_of,
     to_bucket,
@@ -27,8 +30,10 @@ from teaser_jax.solve import (
     find_rotation,
     find_scale,
     find_translation,
+    usable_rows,
 )  # fmt: skip
-from teaser_jax.types import Settings
+from teaser_jax.stages.trust import judge
+from teaser_jax.types import Pose, Problem, Settings
 
 
 @dataclass(frozen=True)
@@ -87,7 +92,8 @@ def profile(
     padded = to_bucket(centred)
     with jax.enable_x64(True):
         scale, scale_pairs = timed("scale", _find_scale, padded, settings)
-        edges = timed("consistency graph", _find_edges, padded, scale)
+        dtype = edge_dtype(padded)
+        edges = timed("consistency graph", lambda *x: _find_edges(*x, dtype=dtype), padded, scale)
         graph = Graph(scale, scale_pairs, edges)
         found = timed("clique, device", _device_clique, padded, graph, settings)
         clique = timed("clique, host", between, padded, graph, found, settings)
@@ -95,13 +101,22 @@ def profile(
         cascade, _ = timed(
             "translation", _find_translation, padded, scale, clique.members, turned.rotation, settings
         )
+        inliers = clique.members
         if settings.refine:
-            timed("refinement", _find_inliers, padded, cascade, settings)
+            inliers, _ = timed("refinement", _find_inliers, padded, cascade, settings)
+        timed("verdict", _judge, padded, cascade, inliers, clique.members, edges)
         solution = jax.device_get(after_clique(padded, graph, clique, settings))
     medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
     return Profile(cold, medians, registration_of(solution, problem, origins))
 
 
+@jax.jit
+def _judge(problem: Problem, pose: Pose, inliers: Array, clique: Array, edge_bits: Array) -> Array:
+    settled = jnp.ones((), bool)
+    return judge(usable_rows(problem)[0], pose, inliers, clique, edge_bits, converged=settled)
+
+
 _find_scale, _find_edges, _find_rotation, _find_translation, _find_inliers, _device_clique = (
-    jax.jit(f) for f in (find_scale, find_edges, find_rotation, find_translation, find_inliers, device_clique)
+    jax.jit(f, static_argnames="dtype" if f is find_edges else ())
+    for f in (find_scale, find_edges, find_rotation, find_translation, find_inliers, device_clique)
 )

@@ -11,7 +11,7 @@ The first three are ``select``, all four ``solve``. ``register`` runs the same p
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -83,10 +83,10 @@ def select(problem: Problem, settings: Settings = Settings()) -> Selection:
     return choose(frozen, graph, find_clique(frozen, graph, settings), settings)[0]
 
 
-def prepare(problem: Problem, settings: Settings = Settings()) -> Graph:
+def prepare(problem: Problem, settings: Settings = Settings(), *, edge_dtype: Any = None) -> Graph:
     """The scale and the consistency graph."""
     scale, scale_pairs = find_scale(problem, settings)
-    return Graph(scale, scale_pairs, find_edges(problem, scale))
+    return Graph(scale, scale_pairs, find_edges(problem, scale, dtype=edge_dtype))
 
 
 def find_scale(
@@ -102,10 +102,13 @@ def find_scale(
     )  # fmt: skip
 
 
-def find_edges(problem: Problem, scale: Float[Array, ""]) -> UInt32[Array, "n w"]:
-    """The consistency graph at a scale."""
+def find_edges(problem: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> UInt32[Array, "n w"]:
+    """The consistency graph at a scale, tested in ``dtype`` (None: that of the problem)."""
     p, _ = usable_rows(problem)
-    return consistency_graph(p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs)
+    src, dst, noise_bound, scale, cbar2 = (
+        x.astype(dtype or p.src.dtype) for x in (p.src, p.dst, p.noise_bound, scale, p.cbar2)
+    )
+    return consistency_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
 
 
 def find_clique(problem: Problem, graph: Graph, settings: Settings = Settings()) -> Clique:

@@ -7,6 +7,8 @@ which is why the test is widened by the rounding it may suffer.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
@@ -26,7 +28,12 @@ def rounding_margin(
     sum and the addition of the bounds.
     """
     reach = [jnp.sqrt(jnp.max(jnp.where(mask, jnp.sum(x * x, axis=1), 0), initial=0)) for x in (src, dst)]
-    return 8 * jnp.finfo(src.dtype).eps * (jnp.abs(scale) * reach[0] + reach[1])
+    return rounding(src.dtype, jnp.abs(scale) * reach[0] + reach[1])
+
+
+def rounding(dtype: Any, reach: Any) -> Any:
+    """The margin of a dtype for points that reach so far from the origin, both clouds added [length]."""
+    return 8 * float(jnp.finfo(dtype).eps) * reach
 
 
 def lengths_agree(

@@ -34,20 +34,24 @@ def fit_similarity(
 ) -> Fit:
     """The minimiser of sum w |b - s R a - t|^2; ``scale=None`` estimates s = tr(R^T H) / sum w |a|^2.
 
-    Weights of zero everywhere, or a source of no extent, give a finite answer (scale 1).
+    Fewer than three weights above zero leave the rotation at the identity, and a source of no extent
+    the scale at 1.
 
     Gradients: exact; the rotation's is zero where it is ambiguous.
 
     References: Horn, JOSA A 1987; Umeyama, PAMI 1991.
     """
     high = lax.Precision.HIGHEST
-    # All weighted sums in one product: of the weights, of a and of b.
+    # All sums in one product: of the weights, of a and of b, and their number.
     columns = jnp.concatenate([jnp.ones_like(src[:, :1]), src, dst], axis=1)
-    sums = jnp.matmul(weights, columns, precision=high)
-    means = sums[1:] / jnp.where(sums[0] > 0, sums[0], 1)
+    rows = jnp.stack([weights, (weights > 0).astype(src.dtype)])
+    sums = jnp.matmul(rows, columns, precision=high)
+    total, count = sums[0, 0], sums[1, 0]
+    means = sums[0, 1:] / jnp.where(total > 0, total, 1)
     src_mean, dst_mean = means[:3], means[3:]
     a, b = src - src_mean, dst - dst_mean
-    h = correlation(weights, a, b)
+    # Rounding would turn the fit of one or two points at random.
+    h = jnp.where(count > 2.5, correlation(weights, a, b), 0)
     rotation = so3.nearest_rotation(h)
     if scale is None:
         below = jnp.sum(weights[:, None] * a * a)
