@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from teaser_jax.packing import unpacked
 from teaser_jax.register import (
     Registration,
     after_clique,
@@ -96,7 +97,8 @@ def profile(
         edges = timed("consistency graph", lambda *x: _find_edges(*x, dtype=dtype), padded, scale)
         graph = Graph(scale, scale_pairs, edges)
         found = timed("clique, device", _device_clique, padded, graph, settings)
-        clique = timed("clique, host", between, padded, graph, found, settings)
+        proved = jnp.sum(found.members) >= found.upper_bound
+        clique = timed("clique, host", between, padded, graph, found, proved, settings)
         turned = timed("rotation", _find_rotation, padded, scale, clique.members, settings)
         cascade, _ = timed(
             "translation", _find_translation, padded, scale, clique.members, turned.rotation, settings
@@ -105,7 +107,7 @@ def profile(
         if settings.refine:
             inliers, _ = timed("refinement", _find_inliers, padded, cascade, settings)
         timed("verdict", _judge, padded, cascade, inliers, clique.members, edges)
-        solution = jax.device_get(after_clique(padded, graph, clique, settings))
+        solution = unpacked(jax.device_get(after_clique(padded, graph, clique, settings)))
     medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
     return Profile(cold, medians, registration_of(solution, problem, origins))
 

@@ -7,9 +7,12 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from teaser_jax import so3
+from teaser_jax.packing import Packed, packed, unpacked
 from teaser_jax.problem import is_traced, pad_problem, read_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
 from teaser_jax.stages.clique import Clique, clique_on_device, search_on_host
@@ -18,6 +21,10 @@ from teaser_jax.stages.invariants import words
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
 
 SMALLEST_BUCKET = 32
+INSIDE_JIT = (
+    "register was called inside jit, vmap or grad. It runs on the host: use "
+    "teaser_jax.solve(teaser_jax.make_problem(...)) there."
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -87,10 +94,7 @@ def register(
     if not isinstance(settings, Settings):
         raise ValueError(f"settings is {settings!r}: expected teaser_jax.Settings(...).")
     if is_traced(src, dst, noise_bound, scale, cbar2, mask, confidence, pairs, settings):
-        raise ValueError(
-            "register was called on traced values, inside jit, vmap or grad. It runs on the host: use "
-            "teaser_jax.solve(teaser_jax.make_problem(...)) there."
-        )
+        raise ValueError(INSIDE_JIT)
     problem = host_problem(
         src, dst, noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
         confidence=confidence, pairs=pairs,
@@ -99,6 +103,8 @@ def register(
     centred, origins = centre(problem)
     try:
         solution = _solved(to_bucket(centred), settings)
+    except jax.errors.TracerArrayConversionError as error:  # constants inside somebody's jit
+        raise ValueError(INSIDE_JIT) from error
     except jax.errors.JaxRuntimeError as error:
         if "memory" not in str(error).lower() and "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -110,13 +116,13 @@ def register(
 
 
 def _solved(problem: Problem, settings: Settings) -> Solution:
-    """Device, host, device; a call inside somebody's jit, on constants, is evaluated at once."""
+    """Device, host, device."""
     # The device never reads the budgets of the host: without them, new budgets compile nothing.
     on_device = replace(settings, clique_nodes=1, clique_seconds=0.0)
-    with jax.enable_x64(True), jax.ensure_compile_time_eval():
-        graph, found = before_clique(problem, on_device, edge_dtype(problem))
-        clique = between(problem, graph, found, settings)
-        return jax.device_get(after_clique(problem, graph, clique, on_device))
+    with jax.enable_x64(True):
+        graph, found, proved = before_clique(problem, on_device, edge_dtype(problem))
+        clique = between(problem, graph, found, proved, settings)
+        return unpacked(jax.device_get(after_clique(problem, graph, clique, on_device)))
 
 
 def _check_numbers(settings: Settings) -> None:
@@ -146,12 +152,17 @@ def centre(problem: Problem) -> tuple[Problem, tuple[np.ndarray, np.ndarray]]:
 
     The median is meant: one absurd coordinate must not move the origin far from the rest.
     """
-    finite = np.isfinite(problem.src).all(axis=1) & np.isfinite(problem.dst).all(axis=1)
-    usable = problem.mask & finite
+    usable = problem.mask & np.isfinite(problem.src).all(axis=1) & np.isfinite(problem.dst).all(axis=1)
     if not usable.any():
         return problem, (np.zeros(3), np.zeros(3))
-    origins = np.median(problem.src[usable], axis=0), np.median(problem.dst[usable], axis=0)
+    origins = _median(problem.src[usable]), _median(problem.dst[usable])
     return replace(problem, src=problem.src - origins[0], dst=problem.dst - origins[1]), origins
+
+
+def _median(points: Any) -> np.ndarray:
+    """Of each coordinate, the upper one of two: a third of the time of ``numpy.median``."""
+    half = len(points) // 2
+    return np.partition(np.ascontiguousarray(points.T), half, axis=1)[:, half]
 
 
 def bucket(n: int) -> int:
@@ -187,10 +198,11 @@ _jit = partial(jax.jit, compiler_options={"xla_disable_hlo_passes": "tree_reduct
 
 
 @partial(_jit, static_argnames="dtype")
-def before_clique(problem: Problem, settings: Settings, dtype: type) -> tuple[Graph, Clique]:
-    """Device program one: scale, graph, and the clique as far as the device takes it."""
+def before_clique(problem: Problem, settings: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
+    """Device program one: scale, graph, and the clique as far as the device takes it; is it proved?"""
     graph = prepare(problem, settings, edge_dtype=dtype)
-    return graph, device_clique(problem, graph, settings)
+    found = device_clique(problem, graph, settings)
+    return graph, found, jnp.sum(found.members, dtype=jnp.int32) >= found.upper_bound
 
 
 def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:
@@ -198,15 +210,8 @@ def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:
     return clique_on_device(graph.edge_bits, usable_rows(problem)[0].mask, method=settings.clique)
 
 
-@_jit
-def after_clique(problem: Problem, graph: Graph, clique: Clique, settings: Settings) -> Solution:
-    """Device program two: the sets, the pose, the verdict."""
-    return conclude(problem, graph, clique, settings)
-
-
-def between(problem: Problem, graph: Graph, found: Clique, settings: Settings) -> Clique:
+def between(problem: Problem, graph: Graph, found: Clique, proved: Array, settings: Settings) -> Clique:
     """The host's turn, between the two programs: nothing where the device has a proof."""
-    proved = int(np.sum(found.members)) >= int(found.upper_bound)
     if settings.clique in ("none", "greedy") or (settings.clique == "exact" and proved):
         return found
     mask = np.asarray(usable_rows(problem)[0].mask)
@@ -214,6 +219,12 @@ def between(problem: Problem, graph: Graph, found: Clique, settings: Settings) -
         np.asarray(graph.edge_bits), mask, found,
         method=settings.clique, nodes=settings.clique_nodes, seconds=settings.clique_seconds,
     )  # fmt: skip
+
+
+@_jit
+def after_clique(problem: Problem, graph: Graph, clique: Clique, settings: Settings) -> Packed:
+    """Device program two: the sets, the pose, the verdict."""
+    return packed(conclude(problem, graph, clique, settings))
 
 
 def registration_of(

@@ -18,7 +18,7 @@ ORDER = [
     "stages.invariants", "stages.bits", "stages.voting", "stages.scale", "stages.consistency",
     "stages.clique_kernels", "stages.clique", "stages.clique_search",
     "stages.rotation", "stages.translation", "stages.refinement", "stages.trust",
-    "problem", "solve", "register", "profile",
+    "problem", "solve", "packing", "register", "profile",
     "metrics", "synthetic", "files", "plots", "cli",
 ]  # fmt: skip
 # The search returns to the module that calls it for one thing: networkx, where numba cannot be had.
