@@ -12,10 +12,10 @@ from pathlib import Path
 import jax
 
 import teaser_jax
-from benchmarks import accuracy, trust
+from benchmarks import accuracy, speed, trust
 
 HERE = Path(__file__).parent
-BENCHMARKS = {"accuracy": accuracy, "trust": trust}
+BENCHMARKS = {"accuracy": accuracy, "trust": trust, "speed": speed}
 
 
 def machine() -> dict[str, str]:
