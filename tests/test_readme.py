@@ -1,0 +1,21 @@
+"""The README's examples run as they stand, one after the other."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+def test_the_examples_run(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+    assert len(blocks) == 2
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert names["result"].ok
+    assert names["batch"].ok.all()
+    said = capsys.readouterr().out
+    assert "ok: OK" in said
+    assert "clique, host" in said
