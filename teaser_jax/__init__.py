@@ -3,7 +3,7 @@
 from teaser_jax import files, metrics, plots, so3, synthetic
 from teaser_jax.problem import make_problem, stack_problems
 from teaser_jax.profile import Profile, profile
-from teaser_jax.register import Registration, register
+from teaser_jax.register import Registration, register, warmup
 from teaser_jax.solve import refit, select, solve
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
 
@@ -12,5 +12,5 @@ __version__ = "0.1.0"
 __all__ = [
     "Pose", "Problem", "Profile", "Registration", "Selection", "Settings", "Solution", "Status",
     "files", "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "so3",
-    "solve", "stack_problems", "synthetic",
+    "solve", "stack_problems", "synthetic", "warmup",
 ]  # fmt: skip

@@ -15,7 +15,7 @@ from teaser_jax import so3
 from teaser_jax.packing import Packed, packed, unpacked
 from teaser_jax.problem import is_traced, pad_problem, read_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
-from teaser_jax.stages.clique import Clique, clique_on_device, search_on_host
+from teaser_jax.stages.clique import Clique, clique_on_device, load_kernels, search_on_host
 from teaser_jax.stages.consistency import rounding
 from teaser_jax.stages.invariants import words
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
@@ -125,6 +125,38 @@ def _solved(problem: Problem, settings: Settings) -> Solution:
         return unpacked(jax.device_get(after_clique(problem, graph, clique, on_device)))
 
 
+def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = Settings()) -> list[int]:
+    """Compile ahead whatever ``register`` needs for up to so many matches; about five seconds a size.
+
+    With ``jax.config.update("jax_compilation_cache_dir", ...)`` the next process finds the programs
+    on disk and needs half a second a size.
+
+    Args:
+        max_points: The largest number of matches to come.
+        scale: None if the scale will be estimated; otherwise any number.
+        settings: Those of the calls to come.
+
+    Returns:
+        The sizes that now stand ready: matches are padded to the next one.
+
+    Raises:
+        ValueError: If ``max_points`` is below 1, or the settings make no sense.
+    """
+    if max_points < 1:
+        raise ValueError(f"max_points is {max_points}: expected the largest number of matches to come.")
+    sizes = sorted({bucket(n) for n in range(1, max_points + 1)})
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], float)
+    for size in sizes:
+        # Five right matches and nothing else: the programs are the same, and soon done.
+        points = np.zeros((size, 3))
+        points[:5] = corners
+        mask = np.arange(size) < 5
+        register(points, points, noise_bound=0.1, scale=scale, mask=mask, settings=settings)
+    if settings.clique == "exact":
+        load_kernels()
+    return sizes
+
+
 def _check_numbers(settings: Settings) -> None:
     """What ``Settings`` cannot check itself, because JAX rebuilds it with placeholders for numbers."""
     low, high = settings.scale_range if len(settings.scale_range) == 2 else (None, None)
@@ -214,9 +246,8 @@ def between(problem: Problem, graph: Graph, found: Clique, proved: Array, settin
     """The host's turn, between the two programs: nothing where the device has a proof."""
     if settings.clique in ("none", "greedy") or (settings.clique == "exact" and proved):
         return found
-    mask = np.asarray(usable_rows(problem)[0].mask)
     return search_on_host(
-        np.asarray(graph.edge_bits), mask, found,
+        np.asarray(graph.edge_bits), np.asarray(problem.mask), found,
         method=settings.clique, nodes=settings.clique_nodes, seconds=settings.clique_seconds,
     )  # fmt: skip
 

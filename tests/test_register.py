@@ -175,6 +175,31 @@ def test_a_stream_of_sizes_shares_programs(problem):
     assert programs() == before
 
 
+def test_after_warmup_nothing_compiles():
+    sizes = tj.warmup(100, settings=tj.Settings(gnc_factor=1.5))
+    assert sizes == [32, 64, 128]
+    compiled, listening = [], [True]
+
+    def listener(event, *_, **__):  # stays registered: older JAX cannot take it back
+        if listening and "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    for n, rate in ((20, 0.2), (50, 0.5), (90, 0.5), (100, 1.0)):
+        drawn = random_problem(n, n=n, outlier_rate=rate, radius=1.0)
+        tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+    assert not compiled
+    tj.register(drawn.src[:10], drawn.dst[:10], noise_bound=0.05, pairs=[(0, 1), (1, 2)])
+    assert compiled  # whatever is new is seen
+    listening.clear()
+
+
+@pytest.mark.parametrize("max_points", [0, -3])
+def test_warmup_wants_a_size(max_points):
+    with pytest.raises(ValueError, match="max_points"):
+        tj.warmup(max_points)
+
+
 def test_profile_names_every_stage(problem, result):
     profile = tj.profile(problem.src, problem.dst, noise_bound=problem.noise_bound, repeats=1)
     assert profile.warm.keys() == profile.cold.keys()

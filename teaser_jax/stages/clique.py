@@ -194,6 +194,13 @@ def search_on_host(
     return Clique(members, np.int32(upper))
 
 
+def load_kernels() -> None:
+    """Load the kernels of the exact search, or compile them once on this machine."""
+    from teaser_jax.stages import clique_search
+
+    clique_search.load_kernels()
+
+
 def _search_batch(edge_bits, mask, members, upper, *, method, nodes, seconds):
     edge_bits, mask, members, upper = (np.asarray(x) for x in (edge_bits, mask, members, upper))
     out = Clique(np.array(members), np.array(upper, dtype=np.int32))

@@ -48,7 +48,7 @@ def search(
 
     Where numba cannot be had, networkx searches instead, exactly but slowly and without budget.
     """
-    kernels = _load_kernels()
+    kernels = load_kernels()
     if kernels is None:
         from teaser_jax.stages.clique import Clique, search_on_host
 
@@ -227,7 +227,7 @@ def _unpack(row: np.ndarray, n: int) -> np.ndarray:
     return np.unpackbits(little, bitorder="little", count=n).astype(bool)
 
 
-def _load_kernels():
+def load_kernels():
     """The compiled kernels, or None without numba. Says one line if it has to compile."""
     global _kernels
     with _loading:
