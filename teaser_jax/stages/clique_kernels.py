@@ -103,34 +103,74 @@ def degeneracy_order(rows):
 
 
 @_compiled
-def grow_clique(rows, seed, clique):
-    """A greedy clique through ``seed`` into ``clique``; returns its size."""
+def grow_clique(rows, seed, share, clique):
+    """A greedy clique through ``seed`` into ``clique``; returns its size.
+
+    Starts from all neighbours and drops those that know fewest of the rest, the lowest ``share`` of
+    the range of degrees at a time, until all know each other; then takes in whoever fits.
+    """
     n, width = rows.shape
-    candidates = rows[seed].copy()
     m = 0
     for w in range(width):
-        m += np.int64(_popcount(candidates[w]))
-    vertices, priority = np.empty(m, np.int64), np.empty(m, np.int64)
+        m += np.int64(_popcount(rows[seed, w]))
+    vertices = np.empty(m, np.int64)
     m = 0
     for w in range(width):
-        rest = candidates[w]
+        rest = rows[seed, w]
         while rest != ZERO:
-            u = 64 * w + np.int64(_lowest(rest))
+            vertices[m] = 64 * w + np.int64(_lowest(rest))
             rest &= rest - ONE
-            common = 0
-            for x in range(width):
-                common += np.int64(_popcount(candidates[x] & rows[u, x]))
-            vertices[m], priority[m] = u, -common
             m += 1
+    sub = induced(rows, vertices)
+    short = sub.shape[1]
+    inside, going = np.zeros(short, np.uint64), np.zeros(short, np.uint64)
+    for i in range(m):
+        inside[i >> 6] |= ONE << np.uint64(i & 63)
+    degree, size = degrees(sub), m
+    while size > 0:
+        lowest, highest = size, -1
+        for i in range(m):
+            if (inside[i >> 6] >> np.uint64(i & 63)) & ONE:
+                lowest, highest = min(lowest, degree[i]), max(highest, degree[i])
+        if lowest >= size - 1:
+            break
+        cut = lowest + np.int64(share * (highest - lowest))
+        alone = lowest == highest  # equals: one goes at a time
+        going[:] = ZERO
+        for i in range(m):
+            if (inside[i >> 6] >> np.uint64(i & 63)) & ONE and degree[i] <= cut:
+                going[i >> 6] |= ONE << np.uint64(i & 63)
+                size -= 1
+                if alone:
+                    break
+        for w in range(short):
+            inside[w] &= ~going[w]
+        for w in range(short):
+            gone = going[w]
+            while gone != ZERO:
+                i = 64 * w + np.int64(_lowest(gone))
+                gone &= gone - ONE
+                for x in range(short):
+                    left = sub[i, x] & inside[x]
+                    while left != ZERO:
+                        degree[64 * x + np.int64(_lowest(left))] -= 1
+                        left &= left - ONE
     clique[0] = seed
     size = 1
-    for i in np.argsort(priority, kind="mergesort"):
-        u = vertices[i]
-        if (candidates[u >> 6] >> np.uint64(u & 63)) & ONE:
-            clique[size] = u
+    fitting = np.full(short, ~ZERO, np.uint64)
+    for i in range(m):
+        if (inside[i >> 6] >> np.uint64(i & 63)) & ONE:
+            clique[size] = vertices[i]
             size += 1
-            for w in range(width):
-                candidates[w] &= rows[u, w]
+            for w in range(short):
+                fitting[w] &= sub[i, w]
+    for i in range(m):
+        known = (inside[i >> 6] >> np.uint64(i & 63)) & ONE
+        if not known and (fitting[i >> 6] >> np.uint64(i & 63)) & ONE:
+            clique[size] = vertices[i]
+            size += 1
+            for w in range(short):
+                fitting[w] &= sub[i, w]
     return size
 
 
