@@ -181,9 +181,7 @@ def run(quick: bool) -> list[dict]:
 
 def _child(part: str, cores: int, quick: bool, variables: dict[str, str] | None = None):
     """Run a part in a process of its own, on so many cores, without anybody's compilation cache."""
-    environment = {
-        k: v for k, v in os.environ.items() if not k.startswith(("JAX_COMPILATION", "JAX_PERSISTENT"))
-    }
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(CACHE)}
     chosen = sorted(os.sched_getaffinity(0))[:cores]
     command = [sys.executable, "-m", "benchmarks.speed", *part.split(), *(["--quick"] if quick else [])]
     done = subprocess.run(

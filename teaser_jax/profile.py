@@ -97,8 +97,7 @@ def profile(
         edges = timed("consistency graph", lambda *x: _find_edges(*x, dtype=dtype), padded, scale)
         graph = Graph(scale, scale_pairs, edges)
         found = timed("clique, device", _device_clique, padded, graph, settings)
-        proved = jnp.sum(found.members) >= found.upper_bound
-        clique = timed("clique, host", between, padded, graph, found, proved, settings)
+        clique = timed("clique, host", between, padded, graph, found, found.proved, settings)
         turned = timed("rotation", _find_rotation, padded, scale, clique.members, settings)
         cascade, _ = timed(
             "translation", _find_translation, padded, scale, clique.members, turned.rotation, settings

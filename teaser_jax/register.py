@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -15,7 +14,8 @@ from teaser_jax import so3
 from teaser_jax.packing import Packed, packed, unpacked
 from teaser_jax.problem import is_traced, pad_problem, read_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
-from teaser_jax.stages.clique import Clique, clique_on_device, load_kernels, search_on_host
+from teaser_jax.stages.clique import Clique, clique_on_device, search_on_host
+from teaser_jax.stages.clique_search import load_kernels
 from teaser_jax.stages.consistency import rounding
 from teaser_jax.stages.invariants import words
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
@@ -184,11 +184,17 @@ def centre(problem: Problem) -> tuple[Problem, tuple[np.ndarray, np.ndarray]]:
 
     The median is meant: one absurd coordinate must not move the origin far from the rest.
     """
-    usable = problem.mask & np.isfinite(problem.src).all(axis=1) & np.isfinite(problem.dst).all(axis=1)
+    usable = _usable(problem)
     if not usable.any():
         return problem, (np.zeros(3), np.zeros(3))
     origins = _median(problem.src[usable]), _median(problem.dst[usable])
     return replace(problem, src=problem.src - origins[0], dst=problem.dst - origins[1]), origins
+
+
+def _usable(problem: Problem) -> np.ndarray:
+    """The rows of numbers, on the host."""
+    finite = np.isfinite(problem.src).all(axis=1) & np.isfinite(problem.dst).all(axis=1)
+    return np.asarray(problem.mask) & finite
 
 
 def _median(points: Any) -> np.ndarray:
@@ -215,7 +221,7 @@ def edge_dtype(problem: Problem) -> type:
 
     The problem is centred. No edge is lost in either precision; a few more may be added.
     """
-    usable = problem.mask & np.isfinite(problem.src).all(axis=1) & np.isfinite(problem.dst).all(axis=1)
+    usable = _usable(problem)
     if problem.scale is None or not usable.any():
         return np.float64
     extent = [np.abs(x[usable]).max() for x in (problem.src, problem.dst)]
@@ -234,7 +240,7 @@ def before_clique(problem: Problem, settings: Settings, dtype: type) -> tuple[Gr
     """Device program one: scale, graph, and the clique as far as the device takes it; is it proved?"""
     graph = prepare(problem, settings, edge_dtype=dtype)
     found = device_clique(problem, graph, settings)
-    return graph, found, jnp.sum(found.members, dtype=jnp.int32) >= found.upper_bound
+    return graph, found, found.proved
 
 
 def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Int, Shaped, UInt32
 
 from teaser_jax.stages.invariants import LANES, words
 
@@ -56,6 +56,17 @@ def listed(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
     n = mask.shape[0]
     place = jnp.where(mask, rank(mask) - 1, n)
     return jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
+
+
+def first_smallest(x: Shaped[Array, " m"]) -> Int[Array, ""]:
+    """``argmin`` from plain reductions.
+
+    Inside a jit, programs are lowered after a caller's x64 block was left. What is lowered by way
+    of other JAX functions (argmin, an iota of 64 bits) then mixes 32 and 64 bits; plain operations
+    on values that are 64 bits wide already do not. Indices are int32 throughout for that reason.
+    """
+    index = jnp.arange(x.shape[0], dtype=jnp.int32)
+    return jnp.min(jnp.where(x == jnp.min(x), index, x.shape[0] - 1))
 
 
 def unpack_host(packed: np.ndarray, n: int) -> np.ndarray:

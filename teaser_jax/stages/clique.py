@@ -31,6 +31,11 @@ class Clique(NamedTuple):
     members: Bool[AnyArray, " n"]
     upper_bound: Int[AnyArray, ""]
 
+    @property
+    def proved(self) -> Bool[AnyArray, ""]:
+        """Whether no clique is larger."""
+        return self.members.sum(dtype=np.int32) >= self.upper_bound
+
 
 def greedy_clique(
     edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"], *, seeds: int = SEEDS_ALONE
@@ -55,7 +60,7 @@ def greedy_clique(
         seeds: Array
 
     def once(state: Search) -> Search:
-        seed = _first_largest(jnp.where(state.untried, degree, -1), index)
+        seed = bits.first_smallest(jnp.where(state.untried, -degree, 1))
         grown = _grow(edge_bits, degree, index, seed) & mask
         larger = jnp.sum(grown, dtype=jnp.int32) > jnp.sum(state.members, dtype=jnp.int32)
         members = jnp.where(larger, grown, state.members)
@@ -70,11 +75,6 @@ def greedy_clique(
     start = Search(jnp.zeros(n, bool), jnp.sum(mask, dtype=jnp.int32), mask, jnp.int32(0))
     final = lax.while_loop(unproved, once, start)
     return Clique(final.members, final.upper_bound)
-
-
-def _first_largest(values: Array, index: Array) -> Array:
-    """``argmax`` from plain reductions, which are vectorised; 32 bits inside any x64 block."""
-    return jnp.min(jnp.where(values == jnp.max(values), index, values.shape[0] - 1))
 
 
 def _grow(edge_bits: Array, degree: Array, index: Array, seed: Array) -> Array:
@@ -97,7 +97,7 @@ def _grow(edge_bits: Array, degree: Array, index: Array, seed: Array) -> Array:
         cut = lowest + (CUT * (size - 1 - lowest).astype(jnp.float32)).astype(jnp.int32)
         complete = lowest >= size - 1
         fitting = ~inside & (joined == size)
-        chosen = _first_largest(jnp.where(fitting, degree, -1), index)
+        chosen = bits.first_smallest(jnp.where(fitting, -degree, 1))
         larger = inside | (fitting & (index == chosen))
         return Growth(jnp.where(complete, larger, inside & (joined > cut)), complete & ~jnp.any(fitting))
 
@@ -169,8 +169,7 @@ def maximum_clique(
 
     if method == "networkx":
         return ask_host()
-    proved = jnp.sum(found.members, dtype=jnp.int32) >= found.upper_bound
-    return lax.cond(proved, lambda: found, ask_host)
+    return lax.cond(found.proved, lambda: found, ask_host)
 
 
 def search_on_host(
@@ -192,13 +191,6 @@ def search_on_host(
 
     members, upper = clique_search.search(np.asarray(edge_bits), members, upper, nodes=nodes, seconds=seconds)
     return Clique(members, np.int32(upper))
-
-
-def load_kernels() -> None:
-    """Load the kernels of the exact search, or compile them once on this machine."""
-    from teaser_jax.stages import clique_search
-
-    clique_search.load_kernels()
 
 
 def _search_batch(edge_bits, mask, members, upper, *, method, nodes, seconds):

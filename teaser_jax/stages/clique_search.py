@@ -15,6 +15,8 @@ import time
 
 import numpy as np
 
+from teaser_jax.stages.clique import CUT
+
 log = logging.getLogger("teaser_jax")
 
 SLICE = 2_000_000  # word operations between two looks at the clock: one or two milliseconds
@@ -22,7 +24,6 @@ SLICE = 2_000_000  # word operations between two looks at the clock: one or two 
 # there are. Seeds are tried until so many in a row gave nothing larger: these, or the square of the
 # edges in units of EDGES. On real graphs of 0.7, 1.6 and 2.8 million edges 8, 8 - 32 and 128 were best.
 PATIENCE, EDGES = 8, 250_000
-CUT = 0.15  # share of the range of degrees that goes at a time
 _kernels = None
 _loading = threading.Lock()
 

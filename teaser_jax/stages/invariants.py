@@ -113,7 +113,7 @@ def fold_pairs(
     @jax.checkpoint
     def step(carry: Carry, lane: tuple) -> tuple[Carry, None]:
         t, use, beta, *columns = lane
-        difference = [row - column for row, column in zip(rows, columns, strict=False)]
+        difference = [row - column for row, column in zip(rows[:6], columns, strict=True)]
         visited = PairSlice(
             tuple(difference[:3]),
             tuple(difference[3:]),

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from teaser_jax.stages.bits import first_smallest
 from teaser_jax.types import Criterion
 
 
@@ -89,7 +90,7 @@ def vote(
     if criterion == "consensus":
         allowed &= size > jnp.max(jnp.where(allowed, size, 0)) - 0.5
     costs = second - first * means - cbar2 * size  # relative to all being outliers
-    best = _first_smallest(jnp.where(allowed, costs, jnp.inf))
+    best = first_smallest(jnp.where(allowed, costs, jnp.inf))
     witness = 0.5 * (begin[best] + until[best])
     members = voters & (jnp.abs(witness - offsets) <= reach) & found
     # Afresh from the members: the running sums carry an error of about 1e-12 of the total cost.
@@ -122,17 +123,6 @@ def _running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
     totals = inside[:, :, -1]
     before = _running_sums(totals) - totals
     return (inside + before[:, :, None]).reshape(c, count * piece)[:, :m]
-
-
-def _first_smallest(x: Float[Array, " m"]) -> Int[Array, ""]:
-    """``argmin`` from plain reductions.
-
-    Inside a jit, programs are lowered after a caller's x64 block was left. What is lowered by way
-    of other JAX functions (argmin, an iota of 64 bits) then mixes 32 and 64 bits; plain operations
-    on values that are 64 bits wide already do not. Indices are int32 throughout for that reason.
-    """
-    index = jnp.arange(x.shape[0], dtype=jnp.int32)
-    return jnp.min(jnp.where(x == jnp.min(x), index, x.shape[0] - 1))
 
 
 def _argsort(keys: Float[Array, " m"]) -> Array:
