@@ -126,10 +126,10 @@ def _solved(problem: Problem, settings: Settings) -> Solution:
 
 
 def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = Settings()) -> list[int]:
-    """Compile ahead whatever ``register`` needs for up to so many matches; about five seconds a size.
+    """Compile ahead whatever ``register`` needs for up to so many matches; six to nine seconds a size.
 
     With ``jax.config.update("jax_compilation_cache_dir", ...)`` the next process finds the programs
-    on disk and needs half a second a size.
+    on disk and needs two or three seconds a size.
 
     Args:
         max_points: The largest number of matches to come.
