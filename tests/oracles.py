@@ -21,6 +21,10 @@ def solve(problem: tj.Problem, settings: tj.Settings = DEFAULT) -> tj.Solution:
     return jax.device_get(_solve(problem, settings))
 
 
+def assert_finite(solution) -> None:
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(solution))
+
+
 class Matches(NamedTuple):
     """A random problem and its truth."""
 

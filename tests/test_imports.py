@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[1] / "teaser_jax"
 ORDER = [
     "so3", "types",
     "stages.invariants", "stages.bits", "stages.voting", "stages.scale", "stages.consistency",
-    "stages.clique_kernels", "stages.clique", "stages.clique_search",
+    "stages.clique_reduction", "stages.clique_branching", "stages.clique", "stages.clique_search",
     "stages.rotation", "stages.translation", "stages.refinement", "stages.trust",
     "problem", "solve", "packing", "register", "profile",
     "metrics", "synthetic", "files", "plots", "cli",

@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from oracles import Matches, joint_residuals, pose_error, problem_of, random_matches, random_pose, solve
+from oracles import (
+    Matches,
+    assert_finite,
+    joint_residuals,
+    pose_error,
+    problem_of,
+    random_matches,
+    random_pose,
+    solve,
+)
 
 import teaser_jax as tj
 from teaser_jax.problem import pad_problem
@@ -49,10 +58,6 @@ def assert_same(a: tj.Solution, b: tj.Solution, *, rows: int | None = None, tole
         assert getattr(a, name) == getattr(b, name), name
     assert pose_error(a.pose, b.pose) <= tolerance
     np.testing.assert_allclose(a.cost, b.cost, atol=1e-9)
-
-
-def assert_finite(solution) -> None:
-    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(solution))
 
 
 # --- one answer however it is run -----------------------------------------------------------------
@@ -333,108 +338,7 @@ def test_no_dtype_is_promoted_by_accident(scale, variant, wide):
     }
 
 
-# --- derivatives ----------------------------------------------------------------------------------
-
-
-def inputs_of(problem: tj.Problem) -> dict:
-    names = ("src", "dst", "noise_bound", "confidence") + (() if problem.scale is None else ("scale",))
-    return {name: getattr(problem, name) for name in names}
-
-
-def both_ways(read, problem, direction, cotangent):
-    """The derivative of a pose along a direction, forward; and the gradient of a combination, reverse."""
-    run = lambda inputs: read(replace(problem, **inputs)).matrix
-    _, forward = jax.jvp(run, (inputs_of(problem),), (direction,))
-    _, pull = jax.vjp(run, inputs_of(problem))
-    return forward, pull(cotangent)[0]
-
-
-@jax.jit
-def derivatives(problem, settings, direction, cotangent):
-    return both_ways(lambda p: tj.solve(p, settings).pose, problem, direction, cotangent)
-
-
-@jax.jit
-def derivatives_of_refit(problem, selection, direction, cotangent):
-    return both_ways(lambda p: tj.refit(p, selection), problem, direction, cotangent)
-
-
-def nothing_of(problem: tj.Problem) -> dict:
-    return {name: np.zeros(np.shape(x)) for name, x in inputs_of(problem).items()}
-
-
-@pytest.mark.parametrize(("scale", "variant"), [(1.3, "default"), (None, "networkx, cascade")])
-def test_forward_reverse_and_central_differences_agree(scale, variant, x64):
-    # The differences re-run the solver. So does the derivative with refinement; that of the cascade is
-    # taken of the read-out, which is its pose.
-    settings, rng = VARIANTS[variant], np.random.default_rng(0)
-    problem = problem_of(matches_of(11), scale=scale, confidence=rng.uniform(0.5, 1, N))
-    plain, cotangent = solve(problem, settings), rng.normal(size=(4, 4))
-    for name, value in inputs_of(problem).items():
-        direction = nothing_of(problem)
-        direction[name] = rng.normal(size=np.shape(value)) * (0.1 if name == "noise_bound" else 1)
-        if settings.refine:
-            forward, gradient = derivatives(problem, settings, direction, cotangent)
-        else:
-            forward, gradient = derivatives_of_refit(problem, plain.selection, direction, cotangent)
-        ahead, behind = (
-            solve(replace(problem, **{name: value + sign * 1e-6 * direction[name]}), settings)
-            for sign in (1, -1)
-        )
-        for moved in (ahead, behind):
-            np.testing.assert_array_equal(moved.inliers, plain.inliers)
-        central = (ahead.pose.matrix - behind.pose.matrix) / 2e-6
-        np.testing.assert_allclose(forward, central, atol=1e-6, err_msg=name)
-        np.testing.assert_allclose(
-            np.sum(gradient[name] * direction[name]), np.sum(cotangent * forward), atol=1e-9
-        )
-        assert np.any(np.abs(forward) > 1e-6), name
-
-
-def test_dead_rows_have_no_gradient_and_spoil_none(x64):
-    settings, cotangent = tj.Settings(), np.random.default_rng(1).normal(size=(4, 4))
-    problem = problem_of(matches_of(12), scale=1.3)
-    nothing = nothing_of(problem)
-    dead = np.arange(N) < 6
-    clean = replace(problem, mask=problem.mask & ~dead)
-    spoiled = replace(
-        problem,
-        src=problem.src.at[0].set(jnp.nan).at[1, 2].set(jnp.inf),
-        dst=problem.dst.at[2].set(jnp.nan),
-        noise_bound=problem.noise_bound.at[3].set(jnp.nan).at[4].set(0.0),
-        confidence=problem.confidence.at[5].set(jnp.nan),
-    )
-    _, expected = derivatives(clean, settings, nothing, cotangent)
-    _, found = derivatives(spoiled, settings, nothing, cotangent)
-    for name in ("src", "dst", "noise_bound", "confidence"):
-        assert np.all(np.isfinite(found[name])), name
-        np.testing.assert_array_equal(np.asarray(found[name])[dead], 0)
-        np.testing.assert_allclose(found[name], expected[name], atol=1e-12)
-    assert int(solve(spoiled).excluded) == 5
-    assert_finite(solve(spoiled))
-
-
-def test_a_hopeless_item_leaves_its_neighbours_untouched(x64):
-    good = problem_of(matches_of(13), scale=None)
-    poisoned = [
-        replace(good, src=jnp.full((N, 3), jnp.nan)),
-        replace(good, mask=jnp.zeros(N, bool)),
-        problem_of(matches_of(14, wrong=1.0), scale=None),
-    ]
-    total = lambda src, problem: jnp.sum(tj.solve(replace(problem, src=src)).pose.matrix)
-    gradient = jax.jit(jax.vmap(jax.grad(total)))
-    answers, slopes = [], []
-    for others in ([good, good, good], poisoned):
-        batch = tj.stack_problems([good, *others])
-        answers.append(solve_batch(batch))
-        slopes.append(np.asarray(gradient(batch.src, batch)))
-        assert_finite(answers[-1])
-        assert np.all(np.isfinite(slopes[-1]))
-    jax.tree.map(np.testing.assert_array_equal, item(answers[1], 0), item(answers[0], 0))
-    np.testing.assert_array_equal(slopes[1][0], slopes[0][0])
-    assert not np.any(answers[1].ok[1:])
-    expected = [tj.Status.TOO_FEW_POINTS, tj.Status.TOO_FEW_POINTS, tj.Status.NO_CONSENSUS]
-    np.testing.assert_array_equal(answers[1].status[1:], expected)
+# --- the smallest and the senseless ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

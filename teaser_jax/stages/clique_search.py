@@ -24,7 +24,7 @@ SLICE = 2_000_000  # word operations between two looks at the clock: one or two 
 # there are. Seeds are tried until so many in a row gave nothing larger: these, or the square of the
 # edges in units of EDGES. On real graphs of 0.7, 1.6 and 2.8 million edges 8, 8 - 32 and 128 were best.
 PATIENCE, EDGES = 8, 250_000
-_kernels = None
+_ready = False
 _loading = threading.Lock()
 
 
@@ -51,14 +51,13 @@ def search(
 
     Where numba cannot be had, networkx searches instead, exactly but slowly and without budget.
     """
-    kernels = load_kernels()
-    if kernels is None:
+    if not load_kernels():
         from teaser_jax.stages.clique import Clique, search_on_host
 
         found = Clique(members, np.int32(upper))
         exact = search_on_host(edge_bits, members | np.any(edge_bits, axis=1), found, method="networkx")
         return exact.members, int(exact.upper_bound)
-    return _Search(kernels, edge_bits, members, upper, nodes, seconds).run()
+    return _Search(edge_bits, members, upper, nodes, seconds).run()
 
 
 class _OutOfBudget(Exception):
@@ -68,8 +67,11 @@ class _OutOfBudget(Exception):
 class _Search:
     """One search. ``best`` (original numbers) and ``upper`` are valid at any moment."""
 
-    def __init__(self, kernels, edge_bits, members, upper, nodes, seconds):
-        self.kernels = kernels
+    def __init__(self, edge_bits, members, upper, nodes, seconds):
+        # Not above: they import numba, which takes its time.
+        from teaser_jax.stages import clique_branching, clique_reduction
+
+        self.reduction, self.branching = clique_reduction, clique_branching
         self.deadline = time.perf_counter() + seconds
         self.nodes_left = nodes
         self.n = members.shape[0]
@@ -98,12 +100,12 @@ class _Search:
         return self.upper == len(self.best)
 
     def keep(self, chosen: np.ndarray) -> None:
-        self.rows = self.kernels.induced(self.rows, chosen)
+        self.rows = self.reduction.induced(self.rows, chosen)
         self.names = self.names[chosen]
 
     def reduce(self) -> None:
         """Shrink the graph to what could hold a larger clique; improve the clique on the way."""
-        k = self.kernels
+        k = self.reduction
         while True:
             before = len(self.names)
             self.peel()
@@ -125,8 +127,8 @@ class _Search:
 
     def peel(self) -> None:
         alive = np.ones(len(self.names), bool)
-        degree = self.kernels.degrees(self.rows)
-        if self.kernels.peel(self.rows, degree, alive, len(self.best)) < len(alive):
+        degree = self.reduction.degrees(self.rows)
+        if self.reduction.peel(self.rows, degree, alive, len(self.best)) < len(alive):
             self.keep(np.flatnonzero(alive))
 
     def grow(self, seeds: np.ndarray, *, patience: float) -> bool:
@@ -137,7 +139,7 @@ class _Search:
         for seed in seeds:
             if covered[seed]:
                 continue
-            size = self.kernels.grow_clique(self.rows, seed, CUT, clique)
+            size = self.reduction.grow_clique(self.rows, seed, CUT, clique)
             covered[clique[:size]] = True
             idle += 1
             if size > len(self.best):
@@ -150,26 +152,25 @@ class _Search:
         return improved
 
     def truss(self) -> int:
-        degree = self.kernels.degrees(self.rows)
+        degree = self.reduction.degrees(self.rows)
         removed, row = 0, 0
         while row < len(self.names):
-            gone, row = self.kernels.drop_weak_edges(self.rows, degree, len(self.best), row, SLICE)
+            gone, row = self.reduction.drop_weak_edges(self.rows, degree, len(self.best), row, SLICE)
             removed += gone
             self.check_budget()
         return removed
 
     def order_and_branch(self) -> None:
-        k = self.kernels
         if self.upper == len(self.best):
             return
-        order, core = k.degeneracy_order(self.rows)
+        order, core = self.reduction.degeneracy_order(self.rows)
         self.keep(np.ascontiguousarray(order[::-1]))  # largest cores first
         if self.lower_upper(int(core.max()) + 1):
             return
         bounds = np.full(len(self.names), self.upper, np.int64)
         vertex = 0
         while vertex < len(bounds):
-            vertex = k.root_bounds(self.rows, len(self.best), bounds, vertex, SLICE)
+            vertex = self.branching.root_bounds(self.rows, len(self.best), bounds, vertex, SLICE)
             self.check_budget()
         if self.lower_upper(int(bounds.max())):
             return
@@ -182,7 +183,7 @@ class _Search:
 
     def branch_root(self, root: int) -> None:
         """Settle the cliques whose latest vertex is ``root``."""
-        k, target = self.kernels, len(self.best)
+        k, target = self.reduction, len(self.best)
         row = _unpack(self.rows[root], len(self.names))
         inside = np.flatnonzero(row[:root])
         if len(inside) < target:
@@ -210,7 +211,7 @@ class _Search:
         )
         finished, visited = False, 0
         while not finished:
-            finished = k.branch(rows, state, *work, SLICE)
+            finished = self.branching.branch(rows, state, *work, SLICE)
             if state[1] + 1 > len(self.best):
                 self.best = self.names[np.append(inside[best[: state[1]]], root)]
             self.nodes_left -= int(state[2]) - visited
@@ -238,29 +239,26 @@ def _unpack(row: np.ndarray, n: int) -> np.ndarray:
     return np.unpackbits(little, bitorder="little", count=n).astype(bool)
 
 
-def load_kernels():
-    """The compiled kernels, or None without numba. Says one line if it has to compile."""
-    global _kernels
+def load_kernels() -> bool:
+    """Make the compiled loops ready; False without numba. Says one line if it has to compile."""
+    global _ready
     with _loading:
-        if _kernels is not None:
-            return _kernels
+        if _ready:
+            return True
         try:
             import numba  # noqa: F401
         except ImportError:
             log.warning("numba is not installed: hard cliques are searched by networkx, slowly")
-            return None
+            return False
         notice = threading.Timer(
             3.0, log.warning, ["compiling the clique search, once on this machine (about 10 s)"]
         )
         notice.daemon = True
         notice.start()
         try:
-            from teaser_jax.stages import clique_kernels
-
-            _kernels = clique_kernels
-            # Two triangles sharing an edge exercise every kernel, so later budgets time the search.
+            # Two triangles sharing an edge exercise every loop, so later budgets time the search.
             square = np.array([0b1110, 0b1101, 0b0011, 0b0011], np.uint64)[:, None]
-            tiny = _Search(clique_kernels, np.zeros((4, 1), np.uint32), np.zeros(4, bool), 4, 100, 60.0)
+            tiny = _Search(np.zeros((4, 1), np.uint32), np.zeros(4, bool), 4, 100, 60.0)
             tiny.rows = square
             tiny.best = np.zeros(1, np.int64)
             tiny.grow(np.arange(1), patience=1)
@@ -268,6 +266,7 @@ def load_kernels():
             tiny.peel()
             tiny.truss()
             tiny.order_and_branch()
+            _ready = True
         finally:
             notice.cancel()
-        return _kernels
+        return True

@@ -1,4 +1,4 @@
-"""Compiled loops of the exact clique search, on graphs packed as rows of 64-bit words.
+"""Compiled loops that shrink a graph before the exact clique search; rows of 64-bit words.
 
 Every loop that can run long takes a budget of *word operations* and says when it is spent, so that
 the caller can look at the clock every few milliseconds. Kernels are compiled by numba on first
@@ -17,7 +17,9 @@ LOW6 = np.uint64(63)
 
 
 @intrinsic
-def _popcount(_, word):
+def count_bits(_, word):
+    """Number of set bits."""
+
     def emit(context, builder, signature, args):
         return builder.ctpop(args[0])
 
@@ -25,7 +27,7 @@ def _popcount(_, word):
 
 
 @intrinsic
-def _lowest(_, word):
+def lowest_bit(_, word):
     """Index of the lowest set bit of a nonzero word."""
 
     def emit(context, builder, signature, args):
@@ -36,21 +38,21 @@ def _lowest(_, word):
     return types.uint64(types.uint64), emit
 
 
-_compiled = njit(cache=True, nogil=True)
+compiled = njit(cache=True, nogil=True)
 
 
-@_compiled
+@compiled
 def degrees(rows):
     """Number of neighbours of each vertex."""
     n, width = rows.shape
     out = np.zeros(n, np.int64)
     for v in range(n):
         for w in range(width):
-            out[v] += np.int64(_popcount(rows[v, w]))
+            out[v] += np.int64(count_bits(rows[v, w]))
     return out
 
 
-@_compiled
+@compiled
 def induced(rows, keep):
     """The subgraph on ``keep``, renumbered in that order."""
     m = len(keep)
@@ -63,7 +65,7 @@ def induced(rows, keep):
     return out
 
 
-@_compiled
+@compiled
 def degeneracy_order(rows):
     """Vertices by repeated removal of the smallest degree, and their core numbers (Matula, Beck)."""
     n, width = rows.shape
@@ -88,7 +90,7 @@ def degeneracy_order(rows):
         for w in range(width):
             rest = rows[v, w] & ~removed[w]
             while rest != ZERO:
-                u = 64 * w + np.int64(_lowest(rest))
+                u = 64 * w + np.int64(lowest_bit(rest))
                 rest &= rest - ONE
                 d = degree[u]
                 if d > degree[v]:  # swap u with the first of its degree, then lower it
@@ -102,7 +104,7 @@ def degeneracy_order(rows):
     return order, degree
 
 
-@_compiled
+@compiled
 def grow_clique(rows, seed, share, clique):
     """A greedy clique through ``seed`` into ``clique``; returns its size.
 
@@ -112,13 +114,13 @@ def grow_clique(rows, seed, share, clique):
     n, width = rows.shape
     m = 0
     for w in range(width):
-        m += np.int64(_popcount(rows[seed, w]))
+        m += np.int64(count_bits(rows[seed, w]))
     vertices = np.empty(m, np.int64)
     m = 0
     for w in range(width):
         rest = rows[seed, w]
         while rest != ZERO:
-            vertices[m] = 64 * w + np.int64(_lowest(rest))
+            vertices[m] = 64 * w + np.int64(lowest_bit(rest))
             rest &= rest - ONE
             m += 1
     sub = induced(rows, vertices)
@@ -148,12 +150,12 @@ def grow_clique(rows, seed, share, clique):
         for w in range(short):
             gone = going[w]
             while gone != ZERO:
-                i = 64 * w + np.int64(_lowest(gone))
+                i = 64 * w + np.int64(lowest_bit(gone))
                 gone &= gone - ONE
                 for x in range(short):
                     left = sub[i, x] & inside[x]
                     while left != ZERO:
-                        degree[64 * x + np.int64(_lowest(left))] -= 1
+                        degree[64 * x + np.int64(lowest_bit(left))] -= 1
                         left &= left - ONE
     clique[0] = seed
     size = 1
@@ -174,7 +176,7 @@ def grow_clique(rows, seed, share, clique):
     return size
 
 
-@_compiled
+@compiled
 def peel(rows, degree, alive, least):
     """Drop vertices of fewer than ``least`` living neighbours, repeatedly; returns how many live."""
     n, width = rows.shape
@@ -193,7 +195,7 @@ def peel(rows, degree, alive, least):
         for w in range(width):
             rest = rows[v, w]
             while rest != ZERO:
-                u = 64 * w + np.int64(_lowest(rest))
+                u = 64 * w + np.int64(lowest_bit(rest))
                 rest &= rest - ONE
                 if alive[u]:
                     degree[u] -= 1
@@ -204,7 +206,7 @@ def peel(rows, degree, alive, least):
     return living
 
 
-@_compiled
+@compiled
 def drop_weak_edges(rows, degree, least, first, budget):
     """Remove edges with fewer than ``least - 1`` common neighbours: no clique of least + 1 has them.
 
@@ -221,14 +223,14 @@ def drop_weak_edges(rows, degree, least, first, budget):
         for w in range(u >> 6, width):
             rest = rows[u, w]
             while rest != ZERO:
-                v = 64 * w + np.int64(_lowest(rest))
+                v = 64 * w + np.int64(lowest_bit(rest))
                 rest &= rest - ONE
                 if v <= u:
                     continue
                 common = 0
                 if degree[u] >= least and degree[v] >= least:
                     for x in range(width):
-                        common += np.int64(_popcount(rows[u, x] & rows[v, x]))
+                        common += np.int64(count_bits(rows[u, x] & rows[v, x]))
                     work += width
                 if common < least - 1:
                     rows[u, w] &= ~(ONE << np.uint64(v & 63))
@@ -237,182 +239,3 @@ def drop_weak_edges(rows, degree, least, first, budget):
                     degree[v] -= 1
                     removed += 1
     return removed, n
-
-
-@_compiled
-def _recolour(rows, classes, v, skip):
-    """Find v a place in a class up to ``skip`` by moving one vertex; returns (found, work).
-
-    If v has a single neighbour q in one class and q has none in a later one, q moves there and v
-    takes its place (the Re-NUMBER step of Tomita and Seki's MCS).
-    """
-    width = rows.shape[1]
-    work = 0
-    for k in range(1, skip):
-        conflicts, q = 0, -1
-        for w in range(width):
-            both = classes[k, w] & rows[v, w]
-            if both != ZERO:
-                conflicts += np.int64(_popcount(both))
-                if conflicts > 1:
-                    break
-                q = 64 * w + np.int64(_lowest(both))
-        work += width
-        if conflicts == 0:
-            classes[k, v >> 6] |= ONE << np.uint64(v & 63)
-            return True, work
-        if conflicts == 1:
-            for other in range(k + 1, skip + 1):
-                free = True
-                for w in range(width):
-                    if classes[other, w] & rows[q, w] != ZERO:
-                        free = False
-                        break
-                work += width
-                if free:
-                    classes[k, q >> 6] &= ~(ONE << np.uint64(q & 63))
-                    classes[other, q >> 6] |= ONE << np.uint64(q & 63)
-                    classes[k, v >> 6] |= ONE << np.uint64(v & 63)
-                    return True, work
-    return False, work
-
-
-@_compiled
-def colour(candidates, rows, skip, order, colours, classes, uncoloured, available):
-    """Greedy colouring; lists only vertices whose colour exceeds ``skip``.
-
-    A clique has at most one vertex of each colour, so only listed vertices can extend a clique by
-    more than ``skip``.
-
-    Returns:
-        How many vertices are listed in ``order`` with their ``colours``, the number of colours
-        used, and the work done.
-    """
-    width = rows.shape[1]
-    listed, k, work = 0, 0, 0
-    left = False
-    for w in range(width):
-        uncoloured[w] = candidates[w]
-        left = left or candidates[w] != ZERO
-    while left:
-        k += 1
-        for w in range(width):
-            available[w] = uncoloured[w]
-            if k <= skip:
-                classes[k, w] = ZERO
-        for w in range(width):
-            while available[w] != ZERO:
-                bit = _lowest(available[w])
-                v = 64 * w + np.int64(bit)
-                available[w] &= available[w] - ONE
-                uncoloured[w] &= ~(ONE << bit)
-                for x in range(w, width):
-                    available[x] &= ~rows[v, x]
-                work += width - w
-                if k <= skip:
-                    classes[k, w] |= ONE << bit
-                else:
-                    placed, more = _recolour(rows, classes, v, skip)
-                    work += more
-                    if not placed:
-                        order[listed], colours[listed] = v, k
-                        listed += 1
-        left = False
-        for w in range(width):
-            if uncoloured[w] != ZERO:
-                left = True
-                break
-    return listed, k, work
-
-
-@_compiled
-def root_bounds(rows, lower, bounds, last, budget):
-    """Colouring bound of each root: cliques whose latest vertex in the order is that root.
-
-    Vertices come with the largest cores first. A root that cannot beat ``lower`` gets ``lower``.
-    Works from vertex 0 upwards, starting at ``last``; returns the vertex to go on with.
-    """
-    n, width = rows.shape
-    candidates, uncoloured, available = (
-        np.empty(width, np.uint64), np.empty(width, np.uint64), np.empty(width, np.uint64),
-    )  # fmt: skip
-    classes = np.zeros((lower + 2, width), np.uint64)
-    order, colours = np.empty(n, np.int64), np.empty(n, np.int64)
-    work = 0
-    for v in range(last, n):
-        if work > budget:
-            return v
-        size = 0
-        for w in range(width):
-            earlier = ZERO
-            if w < v >> 6:
-                earlier = ~ZERO
-            elif w == v >> 6:
-                earlier = (ONE << np.uint64(v & 63)) - ONE
-            candidates[w] = rows[v, w] & earlier
-            size += np.int64(_popcount(candidates[w]))
-        if size < lower:
-            bounds[v] = min(size + 1, lower)
-            continue
-        listed, used, more = colour(
-            candidates, rows, lower - 1, order, colours, classes, uncoloured, available
-        )
-        work += more
-        bounds[v] = lower if listed == 0 else used + 1
-    return n
-
-
-@_compiled
-def branch(rows, state, candidates, order, colours, listed, path, best, classes, scratch, budget):
-    """Branch and bound for a clique larger than ``state[1]``; resumable.
-
-    ``state`` holds depth, size of the best clique, nodes visited, and whether the search began.
-    ``best`` receives the members of every improvement.
-
-    Returns:
-        True when the tree is exhausted, False when the budget of word operations is.
-    """
-    n, width = rows.shape
-    depth, lower, work = state[0], state[1], 0
-    if state[3] == 0:
-        state[3] = 1
-        for w in range(width):
-            candidates[0, w] = ZERO
-        for v in range(n):
-            candidates[0, v >> 6] |= ONE << np.uint64(v & 63)
-        listed[0], _, work = colour(
-            candidates[0], rows, lower, order[0], colours[0], classes, scratch[0], scratch[1]
-        )
-    while depth >= 0:
-        last = listed[depth] - 1
-        if last < 0 or depth + colours[depth, last] <= lower:
-            depth -= 1
-            continue
-        if work > budget:
-            state[0], state[1] = depth, lower
-            return False
-        state[2] += 1
-        listed[depth] = last
-        v = order[depth, last]
-        path[depth] = v
-        candidates[depth, v >> 6] &= ~(ONE << np.uint64(v & 63))
-        empty = True
-        for w in range(width):
-            candidates[depth + 1, w] = candidates[depth, w] & rows[v, w]
-            empty = empty and candidates[depth + 1, w] == ZERO
-        work += width
-        if empty:
-            if depth + 1 > lower:
-                lower = depth + 1
-                for i in range(lower):
-                    best[i] = path[i]
-            continue
-        listed[depth + 1], _, more = colour(
-            candidates[depth + 1], rows, max(lower - depth - 1, 0), order[depth + 1],
-            colours[depth + 1], classes, scratch[0], scratch[1],
-        )  # fmt: skip
-        work += more
-        if listed[depth + 1] > 0:
-            depth += 1
-    state[0], state[1] = -1, lower
-    return True
