@@ -64,17 +64,20 @@ def all_wrong(trials: dict[int, int]) -> Iterator[Case]:
     """No right match at all: sizes, five densities, and three ways of being wrong.
 
     The density of chance agreements follows from the noise bound against the object of size 1.
+    A tenth of the target attracts the wrong matches that are many to one, and six points at least:
+    with the three of n = 30, bound 0.4 spans them all, and no match could be wrong.
     """
     for n, count in trials.items():
         for trial in range(count):
-            bound = (0.02, 0.05, 0.1, 0.15, 0.2)[trial % 5]
+            bound = (0.02, 0.05, 0.1, 0.2, 0.4)[trial % 5]
             kind = ("uniform", "one to one", "many to one")[trial // 5 % 3]
             seed = (7, n, trial)
             known = dict(n=n, outlier_rate=1.0, sigma=bound / 5.54, noise_bound=bound)
             if kind == "uniform":
                 p = synthetic.random_problem(seed, radius=1.0, **known)
             else:
-                p = synthetic.descriptor_problem(seed, hubs=1.0 if kind == "one to one" else 0.2, **known)
+                hubs = 1.0 if kind == "one to one" else max(0.1, 6 / n)
+                p = synthetic.descriptor_problem(seed, hubs=hubs, **known)
             scale = None if n <= 300 and trial // 15 % 2 else 1.0
             cell = f"all wrong, n = {n}, {kind}"
             yield Case(cell, p.src, p.dst, bound, scale, None)
