@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from teaser_jax.stages.histogram_voting import vote_by_histogram
 from teaser_jax.stages.invariants import (
     PairSlice,
     fold_pairs,
@@ -23,6 +24,7 @@ from teaser_jax.stages.invariants import (
 from teaser_jax.stages.voting import vote
 from teaser_jax.types import Criterion
 
+FEW_PAIRS = 32768  # that a sweep over all ends decides sooner than histograms
 ScalePairs = UInt32[Array, "n w"] | Bool[Array, " m"]
 
 
@@ -55,18 +57,22 @@ def estimate_scale(
     with jax.enable_x64(True):
         src, dst, noise_bound, cbar2 = (x.astype(jnp.float64) for x in stopped)
         low, high = (jnp.asarray(x).astype(jnp.float64) for x in scale_range)
-        if pairs is None:
-            values, bounds, usable = _complete_trims(src, dst, noise_bound, mask)
-        else:
+        if pairs is not None:
             values, bounds = trims(tims(src, pairs), tims(dst, pairs), tim_bounds(noise_bound, pairs))
-            usable = usable_pairs(pairs, mask)
-        won = vote(values, bounds, mask=usable, cbar2=cbar2, criterion=criterion, interval=(low, high))
-        chosen = (
-            won.members
-            if pairs is not None
-            else _agreeing_pairs(src, dst, noise_bound, mask, won.witness, cbar2)
-        )
-        return won.estimate.astype(dtype), chosen
+            won = vote(
+                values, bounds, mask=usable_pairs(pairs, mask),
+                cbar2=cbar2, criterion=criterion, interval=(low, high),
+            )  # fmt: skip
+            return won.estimate.astype(dtype), won.members
+        every = CompleteTrims(src, dst, noise_bound, mask)
+        if criterion == "tls" and every.rows * every.length > FEW_PAIRS:
+            found, witness = vote_by_histogram(every, cbar2=cbar2, unit=every.typical(), interval=(low, high))
+        else:
+            values, bounds, usable = every.all()
+            won = vote(values, bounds, mask=usable, cbar2=cbar2, criterion=criterion, interval=(low, high))
+            found, witness = jnp.any(won.members), won.witness
+        scale, chosen = _agreeing_pairs(src, dst, noise_bound, mask & found, witness, cbar2)
+        return scale.astype(dtype), chosen
 
 
 def scale_of_pairs(
@@ -116,38 +122,67 @@ def _columns(values: Float[Array, " n"], lane: Int[Array, ""]) -> Float[Array, "
     return jnp.pad(values, (0, 32 * w - values.shape[0])).reshape(w, 32)[:, lane]
 
 
-def _complete_trims(src: Array, dst: Array, noise_bound: Array, mask: Array) -> tuple[Array, Array, Array]:
-    """TRIMs of every unordered pair once: row k holds the pairs (i, i + k mod n)."""
-    n = src.shape[0]
-    half = n // 2
-    wrap = lambda x: jnp.concatenate([x, x[..., :half]], axis=-1)
-    a2, b2, beta2, mask2 = (wrap(x) for x in (src.T, dst.T, noise_bound, mask))
+class CompleteTrims:
+    """The TRIMs of every unordered pair once: row k holds the pairs (i, i + k + 1 mod n)."""
 
-    index = jnp.arange(n, dtype=jnp.int32)
+    def __init__(self, src: Array, dst: Array, noise_bound: Array, mask: Array) -> None:
+        self.length = src.shape[0]
+        self.rows = self.length // 2
+        self.matches = tuple(jnp.asarray(x) for x in (*src.T, *dst.T, noise_bound, mask))
+        self.wrapped = [jnp.concatenate([x, x[: self.rows]]) for x in self.matches]
+        self.index = jnp.arange(self.length, dtype=jnp.int32)
 
-    def row(k: Array) -> tuple[Array, Array, Array]:
-        shift = lambda x: lax.dynamic_slice_in_dim(x, k, n, axis=-1)
-        a, b = shift(a2) - src.T, shift(b2) - dst.T
-        values, bounds = trims(a.T, b.T, shift(beta2) + noise_bound)
-        once = (2 * k != n) | (index < half)  # half way round, pairs would come twice
-        return values, bounds, shift(mask2) & mask & once
+    def row(self, k: Int[Array, ""]) -> tuple[Array, Array, Array]:
+        """Values, bounds, and which of them can vote, of one row."""
+        others = [lax.dynamic_slice_in_dim(x, k + 1, self.length) for x in self.wrapped]
+        return self._trims(k, self.index, self.matches, others)
 
-    rows = lax.map(row, jnp.arange(1, half + 1, dtype=jnp.int32))
-    return tuple(x.reshape(-1) for x in rows)
+    def recall(self, k: Int[Array, " m"], i: Int[Array, " m"]) -> tuple[Array, Array, Array]:
+        """Those at given rows and places."""
+        j = (i + k + 1) % self.length
+        return self._trims(k, i, [x[i] for x in self.matches], [x[j] for x in self.matches])
+
+    def all(self) -> tuple[Array, Array, Array]:
+        """Every one, row by row."""
+        rows = lax.map(self.row, jnp.arange(self.rows, dtype=jnp.int32))
+        return tuple(x.reshape(-1) for x in rows)
+
+    def typical(self) -> Float[Array, ""]:
+        """The geometric mean of a row: no few absurd points move it far."""
+        values, _, voters = self.row(jnp.int32(0))
+        voters &= values > 0
+        total = jnp.sum(jnp.log(jnp.where(voters, values, 1)))
+        return jnp.exp(total / jnp.maximum(jnp.sum(voters, dtype=jnp.int32), 1))
+
+    def _trims(self, k: Array, i: Array, these: Any, others: Any) -> tuple[Array, Array, Array]:
+        difference = [y - x for x, y in zip(these[:6], others[:6], strict=True)]
+        a2, b2 = squared_norm(tuple(difference[:3])), squared_norm(tuple(difference[3:]))
+        voters = these[7] & others[7] & (a2 > 0)
+        voters &= (2 * (k + 1) != self.length) | (i < self.rows)  # half way round, pairs would come twice
+        inverse = 1 / jnp.sqrt(jnp.where(voters, a2, 1))
+        return jnp.sqrt(b2) * inverse, (these[6] + others[6]) * inverse, voters
 
 
 def _agreeing_pairs(
     src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
-) -> UInt32[Array, "n w"]:
-    """Pairs with | |b_ij| - s |a_ij| | <= c delta_ij and a length to divide by, as bit rows."""
+) -> tuple[Float[Array, ""], UInt32[Array, "n w"]]:
+    """The pairs with | |b_ij| - s |a_ij| | <= c delta_ij and a length to divide by, as bit rows.
+
+    Also their weighted mean (14), as sum w |a||b| / sum w |a|^2 with w = 1 / delta^2.
+    """
     c = jnp.sqrt(cbar2)
 
-    def mark(rows: Array, lane: Array, visited: PairSlice) -> Array:
+    def mark(carry: tuple, lane: Array, visited: PairSlice) -> tuple:
+        rows, above, below = carry
         a2, b2 = squared_norm(visited.src_tims), squared_norm(visited.dst_tims)
-        agree = jnp.abs(jnp.sqrt(b2) - scale * jnp.sqrt(a2)) <= c * visited.bounds
-        agree &= visited.valid & (a2 > 0)
-        return rows | (agree.astype(jnp.uint32) << lane.astype(jnp.uint32))
+        a, b = jnp.sqrt(a2), jnp.sqrt(b2)
+        agree = (jnp.abs(b - scale * a) <= c * visited.bounds) & visited.valid & (a2 > 0)
+        weight = jnp.where(agree, 1 / visited.bounds**2, 0)
+        rows |= agree.astype(jnp.uint32) << lane.astype(jnp.uint32)
+        return rows, above + jnp.sum(weight * a * b), below + jnp.sum(weight * a2)
 
     n = src.shape[0]
-    empty = jnp.zeros((n, words(n)), jnp.uint32)
-    return fold_pairs(mark, empty, src, dst, noise_bound, mask)
+    zero = jnp.zeros((), src.dtype)
+    start = (jnp.zeros((n, words(n)), jnp.uint32), zero, zero)
+    rows, above, below = fold_pairs(mark, start, src, dst, noise_bound, mask)
+    return above / jnp.where(below > 0, below, 1), rows

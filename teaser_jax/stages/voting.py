@@ -7,7 +7,7 @@ running sums of the quadratic costs, meets every consensus set once.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -70,33 +70,56 @@ def vote(
 
     ends = jnp.concatenate([offsets - reach, offsets + reach])
     ends = jnp.where(jnp.concatenate([voters, voters]), ends, jnp.inf)
-    order = _argsort(ends)
+    order = argsort(ends)
     entering = order < k
     sign = jnp.where(entering, 1, -1).astype(dtype)
     who = jnp.where(entering, order, order - k)
     moments = jnp.stack([weights, weights * offsets, weights * offsets**2, voters.astype(dtype)])
-    mass, first, second, size = _running_sums(moments[:, who] * sign)
-
-    # Between two ends the consensus set is constant. Where ends meet within rounding there is no
-    # room to stand in, so such sets count only if no other does.
-    begin = ends[order]
-    until = jnp.concatenate([begin[1:], begin[-1:]])
-    means = first / jnp.where(mass > 0, mass, 1)
-    allowed = (size > 0.5) & (mass > 0)
-    allowed &= (means + centre >= interval[0]) & (means + centre <= interval[1])
-    wide = allowed & (until - begin > 8 * jnp.finfo(dtype).eps * (jnp.abs(begin) + jnp.abs(centre)))
-    allowed = jnp.where(jnp.any(wide), wide, allowed)
-    found = jnp.any(allowed)
-    if criterion == "consensus":
-        allowed &= size > jnp.max(jnp.where(allowed, size, 0)) - 0.5
-    costs = second - first * means - cbar2 * size  # relative to all being outliers
-    best = first_smallest(jnp.where(allowed, costs, jnp.inf))
-    witness = 0.5 * (begin[best] + until[best])
+    found, witness, _ = best_set(
+        ends[order], running_sums(moments[:, who] * sign), centre,
+        cbar2=cbar2, criterion=criterion, interval=interval,
+    )  # fmt: skip
     members = voters & (jnp.abs(witness - offsets) <= reach) & found
     # Afresh from the members: the running sums carry an error of about 1e-12 of the total cost.
     estimate = _mean(jnp.where(members, weights, 0), offsets)
     estimate, witness = (jnp.where(found, x + centre, 0) for x in (estimate, witness))
     return Vote(estimate, witness, members)
+
+
+def best_set(
+    begin: Float[Array, " m"],
+    sums: Float[Array, "4 m"],
+    centre: Float[Array, ""],
+    *,
+    cbar2: Float[Array, ""],
+    criterion: Criterion,
+    interval: tuple[Any, Any],
+    candidates: Bool[Array, " m"] | None = None,
+) -> tuple[Bool[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The best consensus set of a sweep: whether there is one, a number with which it agrees, its cost.
+
+    The cost is relative to calling everything an outlier.
+
+    Args:
+        begin: Sorted ends, from ``centre``; a set lasts from one to the next.
+        sums: Of its members: weights, weighted offsets from the centre, their squares, count.
+        candidates: The sets that compete; None: all.
+    """
+    mass, first, second, size = sums
+    # Between two ends the consensus set is constant. Where ends meet within rounding there is no
+    # room to stand in, so such sets count only if no other does.
+    until = jnp.concatenate([begin[1:], begin[-1:]])
+    means = first / jnp.where(mass > 0, mass, 1)
+    allowed = (size > 0.5) & (mass > 0)
+    allowed &= (means + centre >= interval[0]) & (means + centre <= interval[1])
+    allowed = allowed if candidates is None else allowed & candidates
+    wide = allowed & (until - begin > 8 * jnp.finfo(begin.dtype).eps * (jnp.abs(begin) + jnp.abs(centre)))
+    allowed = jnp.where(jnp.any(wide), wide, allowed)
+    if criterion == "consensus":
+        allowed &= size > jnp.max(jnp.where(allowed, size, 0)) - 0.5
+    costs = second - first * means - cbar2 * size
+    best = first_smallest(jnp.where(allowed, costs, jnp.inf))
+    return jnp.any(allowed), 0.5 * (begin[best] + until[best]), costs[best]
 
 
 def _mean(weights: Float[Array, " k"], values: Float[Array, " k"]) -> Float[Array, ""]:
@@ -106,7 +129,7 @@ def _mean(weights: Float[Array, " k"], values: Float[Array, " k"]) -> Float[Arra
     return above / jnp.where(total > 0, total, 1)
 
 
-def _running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
+def running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
     """Cumulative sums along each row, in products with triangles of ones.
 
     The rows are cut in pieces, summed inside each, and the totals of the pieces are summed the
@@ -121,11 +144,11 @@ def _running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
     triangle = np.triu(np.ones((piece, piece))).astype(x.dtype)
     inside = jnp.matmul(pieces, triangle, precision=lax.Precision.HIGHEST)
     totals = inside[:, :, -1]
-    before = _running_sums(totals) - totals
+    before = running_sums(totals) - totals
     return (inside + before[:, :, None]).reshape(c, count * piece)[:, :m]
 
 
-def _argsort(keys: Float[Array, " m"]) -> Array:
+def argsort(keys: Float[Array, " m"]) -> Array:
     """Indices that sort the keys, index and key packed into one integer where it has room.
 
     XLA sorts single integers on the CPU four times as fast as keys with a payload. Packing drops
