@@ -286,11 +286,11 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
         raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
     if is_traced(src, dst, mask, noise_bound):
         return
-    usable = mask & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
-    if mask.any() and not usable.any():
+    usable = finite_rows(src, dst, mask)
+    if mask.any() and not len(src[usable]):
         raise ValueError("no row of src and dst is finite: every match holds NaN or infinity.")
-    if usable.any():
-        largest = float(max(np.abs(src[usable]).max(), np.abs(dst[usable]).max()))
+    if len(src[usable]):
+        largest = max(extent(src[usable]), extent(dst[usable]))
         kind, bound = jnp.finfo(dtype), float(noise_bound[usable].min())
         # Lengths and bounds appear to the fourth power in the test of edges.
         most, least = float(kind.max) ** 0.25 / 10, float(kind.tiny) ** 0.25 * 10
@@ -306,3 +306,15 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
                 f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % "
                 f"of noise_bound {bound:.3g}. Subtract a common origin from each cloud first{wider}."
             )
+
+
+def finite_rows(src: Any, dst: Any, mask: Any) -> np.ndarray | slice:
+    """What picks the rows of numbers: a slice, which copies nothing, where that is all of them."""
+    if np.all(mask) and np.isfinite(src).all() and np.isfinite(dst).all():
+        return slice(None)
+    return np.asarray(mask) & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
+
+
+def extent(points: Any) -> float:
+    """The largest coordinate, signs apart."""
+    return float(max(points.max(), -points.min()))

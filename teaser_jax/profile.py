@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from teaser_jax.packing import unpacked
+from teaser_jax.packing import fetched, unpacked
 from teaser_jax.register import (
     Registration,
     after_clique,
@@ -93,7 +93,7 @@ def profile(
     padded = to_bucket(centred)
     with jax.enable_x64(True):
         scale, scale_pairs = timed("scale", _find_scale, padded, settings)
-        dtype = edge_dtype(padded)
+        dtype = edge_dtype(centred)
         edges = timed("consistency graph", lambda *x: _find_edges(*x, dtype=dtype), padded, scale)
         graph = Graph(scale, scale_pairs, edges)
         found = timed("clique, device", _device_clique, padded, graph, settings)
@@ -106,7 +106,7 @@ def profile(
         if settings.refine:
             inliers, _ = timed("refinement", _find_inliers, padded, cascade, settings)
         timed("verdict", _judge, padded, cascade, inliers, clique.members, edges)
-        solution = unpacked(jax.device_get(after_clique(padded, graph, clique, settings)))
+        solution = unpacked(fetched(after_clique(padded, graph, clique, settings)))
     medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
     return Profile(cold, medians, registration_of(solution, problem, origins))
 

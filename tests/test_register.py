@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import teaser_jax as tj
+from teaser_jax.register import bucket
 from teaser_jax.synthetic import descriptor_problem, random_problem
 
 N = 60  # most problems here share one bucket, so two programs serve the file
@@ -175,9 +176,25 @@ def test_a_stream_of_sizes_shares_programs(problem):
     assert programs() == before
 
 
-def test_after_warmup_nothing_compiles():
-    sizes = tj.warmup(100, settings=tj.Settings(gnc_factor=1.5))
-    assert sizes == [32, 64, 128]
+def test_eight_programs_serve_a_stream():
+    sizes = {n: bucket(n) for n in range(1, 30_001)}
+    assert all(size >= n for n, size in sizes.items())
+    assert all(size <= max(2 * n, 32) for n, size in sizes.items())
+    assert len({sizes[n] for n in range(300, 6001)}) <= 8
+
+
+@pytest.mark.parametrize(
+    ("most", "stream"),
+    [
+        (100, ((20, 0.2), (50, 0.5), (90, 0.5), (100, 1.0))),
+        pytest.param(
+            6000, ((300, 0.5), (777, 0.8), (1500, 0.9), (3100, 0.95), (6000, 0.95)), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_after_warmup_nothing_compiles(most, stream):
+    sizes = tj.warmup(most, settings=tj.Settings(gnc_factor=1.5))
+    assert sizes == sorted({bucket(n) for n in range(1, most + 1)})
     compiled, listening = [], [True]
 
     def listener(event, *_, **__):  # stays registered: older JAX cannot take it back
@@ -185,11 +202,12 @@ def test_after_warmup_nothing_compiles():
             compiled.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(listener)
-    for n, rate in ((20, 0.2), (50, 0.5), (90, 0.5), (100, 1.0)):
+    for n, rate in stream:
         drawn = random_problem(n, n=n, outlier_rate=rate, radius=1.0)
         tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
     assert not compiled
-    tj.register(drawn.src[:10], drawn.dst[:10], noise_bound=0.05, pairs=[(0, 1), (1, 2)])
+    new = tj.Settings(gnc_iterations=100 + most)
+    tj.register(drawn.src[:10], drawn.dst[:10], noise_bound=0.05, settings=new)
     assert compiled  # whatever is new is seen
     listening.clear()
 
