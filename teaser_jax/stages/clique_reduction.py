@@ -55,13 +55,19 @@ def degrees(rows):
 @compiled
 def induced(rows, keep):
     """The subgraph on ``keep``, renumbered in that order."""
-    m = len(keep)
+    m, (n, width) = len(keep), rows.shape
     out = np.zeros((m, max((m + 63) >> 6, 1)), np.uint64)
+    place, kept = np.empty(n, np.int64), np.zeros(width, np.uint64)
     for i in range(m):
-        row = rows[keep[i]]
-        for j in range(m):
-            v = np.uint64(keep[j])
-            out[i, j >> 6] |= ((row[v >> np.uint64(6)] >> (v & LOW6)) & ONE) << np.uint64(j & 63)
+        place[keep[i]] = i
+        kept[keep[i] >> 6] |= ONE << np.uint64(keep[i] & 63)
+    for i in range(m):
+        for w in range(width):
+            rest = rows[keep[i], w] & kept[w]
+            while rest != ZERO:
+                j = place[64 * w + np.int64(lowest_bit(rest))]
+                rest &= rest - ONE
+                out[i, j >> 6] |= ONE << np.uint64(j & 63)
     return out
 
 
@@ -207,26 +213,27 @@ def peel(rows, degree, alive, least):
 
 
 @compiled
-def drop_weak_edges(rows, degree, least, first, budget):
+def drop_weak_edges(rows, degree, least, last, budget):
     """Remove edges with fewer than ``least - 1`` common neighbours: no clique of least + 1 has them.
 
-    Works on the rows from ``first`` until the budget is spent.
+    Works on the rows from ``last`` down to 0 until the budget is spent: vertices come with the largest
+    cores first, and what the small ones lose, the large ones need not be asked for.
 
     Returns:
-        Edges removed, and the row to go on with (n when the pass is complete).
+        Edges removed, and the row to go on with (-1 when the pass is complete).
     """
-    n, width = rows.shape
+    width = rows.shape[1]
     removed, work = 0, 0
-    for u in range(first, n):
+    for u in range(last, -1, -1):
         if work > budget:
             return removed, u
-        for w in range(u >> 6, width):
+        for w in range((u >> 6) + 1):
             rest = rows[u, w]
             while rest != ZERO:
                 v = 64 * w + np.int64(lowest_bit(rest))
                 rest &= rest - ONE
-                if v <= u:
-                    continue
+                if v >= u:
+                    break
                 common = 0
                 if degree[u] >= least and degree[v] >= least:
                     for x in range(width):
@@ -238,4 +245,4 @@ def drop_weak_edges(rows, degree, least, first, budget):
                     degree[u] -= 1
                     degree[v] -= 1
                     removed += 1
-    return removed, n
+    return removed, -1

@@ -111,11 +111,11 @@ class _Search:
             self.peel()
             if self.lower_upper(0 if len(self.names) == 0 else self.upper):
                 return
-            order, core = k.degeneracy_order(self.rows)
-            if self.lower_upper(int(core.max()) + 1):
+            self.order()
+            if self.lower_upper(self.colours()):
                 return
             edges = int(k.degrees(self.rows).sum()) // 2
-            improved = self.grow(order[::-1], patience=max(PATIENCE, (edges / EDGES) ** 2))
+            improved = self.grow(patience=max(PATIENCE, (edges / EDGES) ** 2))
             if self.lower_upper(self.upper):
                 return
             removed = self.truss()
@@ -131,12 +131,29 @@ class _Search:
         if self.reduction.peel(self.rows, degree, alive, len(self.best)) < len(alive):
             self.keep(np.flatnonzero(alive))
 
-    def grow(self, seeds: np.ndarray, *, patience: float) -> bool:
-        """Greedy cliques from seeds that no clique so far has, until ``patience`` of them are no larger."""
+    def order(self) -> None:
+        """Number the vertices by degeneracy, largest cores first, and take the bound that gives."""
+        order, core = self.reduction.degeneracy_order(self.rows)
+        self.keep(np.ascontiguousarray(order[::-1]))
+        self.lower_upper(int(core.max()) + 1)
+
+    def colours(self) -> int:
+        """Colours that do for the whole graph: half the bound of the cores, for next to nothing."""
+        n, width = self.rows.shape
+        everyone = np.zeros(64 * width, bool)
+        everyone[:n] = True
+        candidates = np.packbits(everyone, bitorder="little").view("<u8").astype(np.uint64)
+        listed = np.empty((2, n + 1), np.int64)
+        scratch, classes = np.empty((2, width), np.uint64), np.zeros((2, width), np.uint64)
+        _, used, _ = self.branching.colour(candidates, self.rows, 0, *listed, classes, *scratch)
+        return int(used)
+
+    def grow(self, *, patience: float) -> bool:
+        """Greedy cliques from vertices in no clique so far, until ``patience`` of them are no larger."""
         clique = np.empty(len(self.names) + 1, np.int64)
         covered = np.zeros(len(self.names), bool)
         improved, idle = False, 0
-        for seed in seeds:
+        for seed in range(len(self.names)):
             if covered[seed]:
                 continue
             size = self.reduction.grow_clique(self.rows, seed, CUT, clique)
@@ -153,8 +170,8 @@ class _Search:
 
     def truss(self) -> int:
         degree = self.reduction.degrees(self.rows)
-        removed, row = 0, 0
-        while row < len(self.names):
+        removed, row = 0, len(self.names) - 1
+        while row >= 0:
             gone, row = self.reduction.drop_weak_edges(self.rows, degree, len(self.best), row, SLICE)
             removed += gone
             self.check_budget()
@@ -163,9 +180,8 @@ class _Search:
     def order_and_branch(self) -> None:
         if self.upper == len(self.best):
             return
-        order, core = self.reduction.degeneracy_order(self.rows)
-        self.keep(np.ascontiguousarray(order[::-1]))  # largest cores first
-        if self.lower_upper(int(core.max()) + 1):
+        self.order()
+        if self.lower_upper(self.colours()):
             return
         bounds = np.full(len(self.names), self.upper, np.int64)
         vertex = 0
@@ -261,7 +277,7 @@ def load_kernels() -> bool:
             tiny = _Search(np.zeros((4, 1), np.uint32), np.zeros(4, bool), 4, 100, 60.0)
             tiny.rows = square
             tiny.best = np.zeros(1, np.int64)
-            tiny.grow(np.arange(1), patience=1)
+            tiny.grow(patience=1)
             tiny.best = np.zeros(1, np.int64)
             tiny.peel()
             tiny.truss()
