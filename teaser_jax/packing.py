@@ -1,21 +1,80 @@
-"""A solution in few arrays, for the way from the device to the host.
+"""Problems and solutions in few arrays, for the way to the device and back.
 
-To fetch an array costs as much as to solve a small problem, whatever its size.
+Whatever its size, each array that is sent or fetched takes as long as several stages of a small problem.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from teaser_jax.so3 import AnyArray
-from teaser_jax.types import Pose, Selection, Solution
+from teaser_jax.types import Pose, Problem, Selection, Settings, Solution
 
 
-class Packed(NamedTuple):
+class PackedProblem(NamedTuple):
+    """A problem, and the numbers of its settings, in two arrays, or three."""
+
+    columns: Float[AnyArray, "9 n"]  # src, dst, noise_bound, confidence, mask: each in one piece
+    numbers: Float[AnyArray, " c"]  # cbar2, gnc_factor, gnc_tolerance, scale_range, and the scale if known
+    pairs: Int[AnyArray, "m 2"] | None
+
+    @property
+    def mask(self) -> Bool[AnyArray, " n"]:
+        """Rows to use."""
+        return self.columns[8] > 0
+
+
+def pack_problem(problem: Problem, settings: Settings, n: int, m: int | None) -> PackedProblem:
+    """A problem on the host, padded to n rows and m pairs; padding is masked and changes nothing."""
+    count = len(problem.src)
+    columns = np.zeros((9, n))
+    columns[:3, :count], columns[3:6, :count] = problem.src.T, problem.dst.T
+    columns[6, :count], columns[7, :count], columns[8, :count] = problem.noise_bound, problem.confidence, problem.mask
+    known = () if problem.scale is None else (problem.scale,)
+    numbers = (problem.cbar2, settings.gnc_factor, settings.gnc_tolerance, *settings.scale_range, *known)
+    pairs = problem.pairs
+    if pairs is not None and m is not None:
+        pairs = np.zeros((m, 2), np.int32)
+        pairs[: len(problem.pairs)] = problem.pairs
+    return PackedProblem(columns, np.array(numbers, np.float64), pairs)
+
+
+def unpack_problem(packed: PackedProblem, choices: Settings) -> tuple[Problem, Settings]:
+    """The problem and its settings again, on the device; ``choices`` are the settings without numbers."""
+    columns, numbers = packed.columns, packed.numbers
+    problem = Problem(
+        src=columns[:3].T,
+        dst=columns[3:6].T,
+        noise_bound=columns[6],
+        cbar2=numbers[0],
+        mask=packed.mask,
+        confidence=columns[7],
+        scale=numbers[5] if len(numbers) == 6 else None,
+        pairs=packed.pairs,
+    )
+    settings = replace(
+        choices, gnc_factor=numbers[1], gnc_tolerance=numbers[2], scale_range=(numbers[3], numbers[4])
+    )
+    return problem, settings
+
+
+def choices_of(settings: Settings) -> Settings:
+    """What a device program is compiled for: without numbers, which it is sent, and without the host's budgets.
+
+    So neither new numbers nor new budgets compile anything.
+    """
+    return replace(
+        settings, gnc_factor=None, gnc_tolerance=None, scale_range=(None, None), clique_nodes=1, clique_seconds=0.0
+    )
+
+
+class PackedSolution(NamedTuple):
     """A solution in two arrays, or up to four."""
 
     numbers: AnyArray  # rotation, translation, scale, cost, and the counts and flags, all exact in float64
@@ -23,7 +82,7 @@ class Packed(NamedTuple):
     pair_sets: tuple[AnyArray | None, AnyArray | None]  # of the scale; of the rotation, where not in masks
 
 
-def packed(solution: Solution) -> Packed:
+def pack_solution(solution: Solution) -> PackedSolution:
     """The arrays of a solution, fewer and longer."""
     pose, chosen = solution.pose, solution.selection
     counts = [
@@ -36,15 +95,15 @@ def packed(solution: Solution) -> Packed:
     chain = chosen.rotation.shape == chosen.clique.shape and chosen.rotation.dtype == bool
     masks += [chosen.rotation[:, None]] if chain else []
     rotation = None if chain else chosen.rotation
-    return Packed(jnp.concatenate(numbers), jnp.concatenate(masks, axis=1), (chosen.scale_pairs, rotation))
+    return PackedSolution(jnp.concatenate(numbers), jnp.concatenate(masks, axis=1), (chosen.scale_pairs, rotation))
 
 
-def fetched(solution: Packed) -> Packed:
+def fetched(solution: PackedSolution) -> PackedSolution:
     """The arrays on the host: a tenth of the time of ``jax.device_get`` where that is the device."""
     return jax.tree.map(np.asarray, solution)
 
 
-def unpacked(host: Packed) -> Solution:
+def unpack_solution(host: PackedSolution) -> Solution:
     """The solution again, in numpy."""
     numbers, masks, (scale_pairs, rotation) = host
     pose = Pose(numbers[:9].reshape(3, 3), numbers[9:12], numbers[12])

@@ -149,11 +149,13 @@ def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
     )
 
 
+CONCRETE = (np.ndarray, float, int, type(None))
+
+
 def is_traced(*values: Any) -> bool:
     """Whether any leaf is a tracer, so that its value is not known."""
-    known = np.ndarray | float | int | None
-    unclear = [x for x in values if not isinstance(x, known)]
-    return any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
+    unclear = [x for x in values if not isinstance(x, CONCRETE)]
+    return bool(unclear) and any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
 
 
 def as_numpy(value: Any, name: str) -> np.ndarray:

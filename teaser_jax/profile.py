@@ -12,17 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from teaser_jax.packing import fetched, unpacked
+from teaser_jax.packing import choices_of, fetched, pack_problem, unpack_solution
+from teaser_jax.problem import finite_rows, pad_problem
 from teaser_jax.register import (
     Registration,
     after_clique,
     between,
+    buckets,
     centre,
     device_clique,
     edge_dtype,
     host_problem,
     registration_of,
-    to_bucket,
 )  # fmt: skip
 from teaser_jax.solve import (
     Graph,
@@ -89,11 +90,12 @@ def profile(
                 warm.setdefault(name, []).append(seconds)
         return output
 
-    centred, origins = timed("centre", centre, problem)
-    padded = to_bucket(centred)
+    usable = finite_rows(problem.src, problem.dst, problem.mask)
+    centred, origins = timed("centre", centre, problem, usable)
+    padded = pad_problem(centred, *buckets(centred))
     with jax.enable_x64(True):
         scale, scale_pairs = timed("scale", _find_scale, padded, settings)
-        dtype = edge_dtype(centred)
+        dtype = edge_dtype(centred, usable)
         edges = timed("consistency graph", lambda *x: _find_edges(*x, dtype=dtype), padded, scale)
         graph = Graph(scale, scale_pairs, edges)
         found = timed("clique, device", _device_clique, padded, graph, settings)
@@ -106,7 +108,8 @@ def profile(
         if settings.refine:
             inliers, _ = timed("refinement", _find_inliers, padded, cascade, settings)
         timed("verdict", _judge, padded, cascade, inliers, clique.members, edges)
-        solution = unpacked(fetched(after_clique(padded, graph, clique, settings)))
+        sent = pack_problem(centred, settings, *buckets(centred))
+        solution = unpack_solution(fetched(after_clique(sent, graph, clique, choices_of(settings))))
     medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
     return Profile(cold, medians, registration_of(solution, problem, origins))
 

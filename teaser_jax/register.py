@@ -11,8 +11,17 @@ import numpy as np
 from jaxtyping import Array
 
 from teaser_jax import so3
-from teaser_jax.packing import Packed, fetched, packed, unpacked
-from teaser_jax.problem import extent, finite_rows, is_traced, pad_problem, read_problem
+from teaser_jax.packing import (
+    PackedProblem,
+    PackedSolution,
+    choices_of,
+    fetched,
+    pack_problem,
+    pack_solution,
+    unpack_problem,
+    unpack_solution,
+)  # fmt: skip
+from teaser_jax.problem import extent, finite_rows, is_traced, read_problem
 from teaser_jax.solve import Graph, conclude, prepare, usable_rows
 from teaser_jax.stages.clique import Clique, clique_on_device, search_on_host
 from teaser_jax.stages.clique_search import load_kernels
@@ -100,9 +109,10 @@ def register(
         confidence=confidence, pairs=pairs,
     )  # fmt: skip
     _check_numbers(settings)
-    centred, origins = centre(problem)
+    usable = finite_rows(problem.src, problem.dst, problem.mask)
+    centred, origins = centre(problem, usable)
     try:
-        solution = _solved(to_bucket(centred), settings, edge_dtype(centred))
+        solution = _solved(centred, settings, edge_dtype(centred, usable))
     except jax.errors.TracerArrayConversionError as error:  # constants inside somebody's jit
         raise ValueError(INSIDE_JIT) from error
     except jax.errors.JaxRuntimeError as error:
@@ -117,12 +127,11 @@ def register(
 
 def _solved(problem: Problem, settings: Settings, dtype: type) -> Solution:
     """Device, host, device; edges are tested in ``dtype``."""
-    # The device never reads the budgets of the host: without them, new budgets compile nothing.
-    on_device = replace(settings, clique_nodes=1, clique_seconds=0.0)
+    sent, choices = pack_problem(problem, settings, *buckets(problem)), choices_of(settings)
     with jax.enable_x64(True):
-        graph, found, proved = before_clique(problem, on_device, dtype)
-        clique = between(problem, graph, found, proved, settings)
-        return unpacked(fetched(after_clique(problem, graph, clique, on_device)))
+        graph, found, proved = before_clique(sent, choices, dtype)
+        clique = between(sent, graph, found, proved, settings)
+        return unpack_solution(fetched(after_clique(sent, graph, clique, choices)))
 
 
 def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = Settings()) -> list[int]:
@@ -179,12 +188,11 @@ def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
     return read_problem(src, dst, dtype=np.dtype(np.float64), **known)
 
 
-def centre(problem: Problem) -> tuple[Problem, tuple[np.ndarray, np.ndarray]]:
+def centre(problem: Problem, usable: np.ndarray | slice) -> tuple[Problem, tuple[np.ndarray, np.ndarray]]:
     """The problem about the middle of its usable points, and the two origins taken away.
 
     The median is meant: one absurd coordinate must not move the origin far from the rest.
     """
-    usable = finite_rows(problem.src, problem.dst, problem.mask)
     src, dst = problem.src[usable], problem.dst[usable]
     if not len(src):
         return problem, (np.zeros(3), np.zeros(3))
@@ -209,18 +217,17 @@ def bucket(n: int) -> int:
     return -(-n // step) * step
 
 
-def to_bucket(problem: Problem) -> Problem:
-    """The problem padded to its buckets of matches and pairs."""
+def buckets(problem: Problem) -> tuple[int, int | None]:
+    """The padded sizes of its matches and of its pairs, if they are given."""
     m = None if problem.pairs is None else bucket(problem.pairs.shape[0])
-    return pad_problem(problem, bucket(problem.src.shape[0]), m)
+    return bucket(problem.src.shape[0]), m
 
 
-def edge_dtype(problem: Problem) -> type:
+def edge_dtype(problem: Problem, usable: np.ndarray | slice) -> type:
     """float32 where that widens no edge test by more than a thousandth of the bound: twice as fast.
 
     The problem is centred. No edge is lost in either precision; a few more may be added.
     """
-    usable = finite_rows(problem.src, problem.dst, problem.mask)
     src, dst = problem.src[usable], problem.dst[usable]
     if problem.scale is None or not len(src):
         return np.float64
@@ -231,7 +238,7 @@ def edge_dtype(problem: Problem) -> type:
 
 
 # XLA splits each long sum into two kernels on the CPU: half as many again to compile, and no faster.
-WHOLE_SUMS = {"xla_disable_hlo_passes": "tree_reduction_rewriter"}
+WHOLE_SUMS = {"xla_disable_hlo_passes": "tree_reduction_rewriter", "xla_backend_optimization_level": 1}
 # Lengths of a million pairs: an eighth of the time is saved where the CPU has such vectors.
 WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
 # Its older emitters compile in two thirds of the time. What they make of the small kernels behind the
@@ -240,8 +247,9 @@ OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ 
 
 
 @partial(jax.jit, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)
-def before_clique(problem: Problem, settings: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
+def before_clique(sent: PackedProblem, choices: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
     """Device program one: scale, graph, and the clique as far as the device takes it; is it proved?"""
+    problem, settings = unpack_problem(sent, choices)
     graph = prepare(problem, settings, edge_dtype=dtype)
     found = device_clique(problem, graph, settings)
     return graph, found, found.proved
@@ -252,7 +260,9 @@ def device_clique(problem: Problem, graph: Graph, settings: Settings) -> Clique:
     return clique_on_device(graph.edge_bits, usable_rows(problem)[0].mask, method=settings.clique)
 
 
-def between(problem: Problem, graph: Graph, found: Clique, proved: Array, settings: Settings) -> Clique:
+def between(
+    problem: PackedProblem | Problem, graph: Graph, found: Clique, proved: Array, settings: Settings
+) -> Clique:
     """The host's turn, between the two programs: nothing where the device has a proof."""
     if settings.clique in ("none", "greedy") or (settings.clique == "exact" and proved):
         return found
@@ -263,9 +273,10 @@ def between(problem: Problem, graph: Graph, found: Clique, proved: Array, settin
 
 
 @partial(jax.jit, compiler_options=WHOLE_SUMS | OLDER_EMITTERS)
-def after_clique(problem: Problem, graph: Graph, clique: Clique, settings: Settings) -> Packed:
+def after_clique(sent: PackedProblem, graph: Graph, clique: Clique, choices: Settings) -> PackedSolution:
     """Device program two: the sets, the pose, the verdict."""
-    return packed(conclude(problem, graph, clique, settings))
+    problem, settings = unpack_problem(sent, choices)
+    return pack_solution(conclude(problem, graph, clique, settings))
 
 
 def registration_of(

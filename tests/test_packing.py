@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import teaser_jax as tj
-from teaser_jax.packing import packed, unpacked
+from teaser_jax.packing import pack_solution, unpack_solution
 
 CASES = {
     "chain": {},
@@ -27,7 +27,7 @@ def test_nothing_is_lost(case, x64):
     drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
     problem = tj.make_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, **known)
     solution = jax.jit(tj.solve)(problem, settings)
-    found = unpacked(jax.device_get(jax.jit(packed)(solution)))
+    found = unpack_solution(jax.device_get(jax.jit(pack_solution)(solution)))
     for before, after in zip(jax.tree.leaves(solution), jax.tree.leaves(found), strict=True):
         assert before.dtype == after.dtype
         np.testing.assert_array_equal(before, after)
