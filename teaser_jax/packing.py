@@ -6,7 +6,7 @@ Whatever its size, each array that is sent or fetched takes as long as several s
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,11 +35,12 @@ def pack_problem(problem: Problem, settings: Settings, n: int, m: int | None) ->
     count = len(problem.src)
     columns = np.zeros((9, n))
     columns[:3, :count], columns[3:6, :count] = problem.src.T, problem.dst.T
-    columns[6, :count], columns[7, :count], columns[8, :count] = problem.noise_bound, problem.confidence, problem.mask
+    columns[6, :count], columns[7, :count] = problem.noise_bound, problem.confidence
+    columns[8, :count] = problem.mask
     known = () if problem.scale is None else (problem.scale,)
     numbers = (problem.cbar2, settings.gnc_factor, settings.gnc_tolerance, *settings.scale_range, *known)
-    pairs = problem.pairs
-    if pairs is not None and m is not None:
+    pairs = None
+    if problem.pairs is not None and m is not None:
         pairs = np.zeros((m, 2), np.int32)
         pairs[: len(problem.pairs)] = problem.pairs
     return PackedProblem(columns, np.array(numbers, np.float64), pairs)
@@ -65,13 +66,12 @@ def unpack_problem(packed: PackedProblem, choices: Settings) -> tuple[Problem, S
 
 
 def choices_of(settings: Settings) -> Settings:
-    """What a device program is compiled for: without numbers, which it is sent, and without the host's budgets.
+    """What a device program is compiled for: no numbers, which it is sent, and no budgets of the host.
 
     So neither new numbers nor new budgets compile anything.
     """
-    return replace(
-        settings, gnc_factor=None, gnc_tolerance=None, scale_range=(None, None), clique_nodes=1, clique_seconds=0.0
-    )
+    numbers: dict[str, Any] = dict(gnc_factor=None, gnc_tolerance=None, scale_range=(None, None))
+    return replace(settings, **numbers, clique_nodes=1, clique_seconds=0.0)
 
 
 class PackedSolution(NamedTuple):
@@ -95,7 +95,9 @@ def pack_solution(solution: Solution) -> PackedSolution:
     chain = chosen.rotation.shape == chosen.clique.shape and chosen.rotation.dtype == bool
     masks += [chosen.rotation[:, None]] if chain else []
     rotation = None if chain else chosen.rotation
-    return PackedSolution(jnp.concatenate(numbers), jnp.concatenate(masks, axis=1), (chosen.scale_pairs, rotation))
+    return PackedSolution(
+        jnp.concatenate(numbers), jnp.concatenate(masks, axis=1), (chosen.scale_pairs, rotation)
+    )
 
 
 def fetched(solution: PackedSolution) -> PackedSolution:

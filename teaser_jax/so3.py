@@ -89,6 +89,7 @@ def singular_frames(
 Axes = tuple[Float[Array, "2 3"], Float[Array, "2 3"]]
 
 
+@jax.jit  # traced once, not once a use: half of it is meant for other devices
 def _leading_axes(matrix: Float[Array, "3 3"]) -> Axes:
     return lax.platform_dependent(matrix, cpu=_leading_axes_lapack, default=leading_axes_jacobi)
 

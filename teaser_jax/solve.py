@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
@@ -274,6 +275,7 @@ def _rotation_of(p: Problem, members: Array, chosen: Array) -> Float[Array, "3 3
     return so3.nearest_rotation(h)
 
 
+@jax.jit  # traced once, not by every stage
 def usable_rows(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
     """The problem with unusable rows masked and made harmless, and the count of non-finite rows.
 

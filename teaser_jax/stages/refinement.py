@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -26,6 +27,7 @@ class Fit(NamedTuple):
     src_mean: Float[Array, "3"]
 
 
+@jax.jit
 def fit_similarity(
     src: Float[Array, "n 3"],
     dst: Float[Array, "n 3"],
@@ -62,6 +64,7 @@ def fit_similarity(
     return Fit(Pose(rotation, translation, scale), h, src_mean)
 
 
+@jax.jit
 def squared_residuals(
     pose: Pose, src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"]
 ) -> Float[Array, " n"]:
