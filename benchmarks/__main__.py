@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import time
-from importlib.metadata import version
+import sys
 from pathlib import Path
 
-import jax
-
-import teaser_jax
-from benchmarks import accuracy, speed, trust
+from benchmarks import accuracy, baseline, clique, cold, growth, speed, stream, trust
 
 HERE = Path(__file__).parent
-BENCHMARKS = {"accuracy": accuracy, "trust": trust, "speed": speed}
-
-
-def machine() -> dict[str, str]:
-    """What the numbers were measured on."""
-    return {
-        "device": str(jax.devices()[0]),
-        "cpu": platform.processor() or platform.machine(),
-        "python": platform.python_version(),
-        "teaser_jax": teaser_jax.__version__,
-        **{name: version(name) for name in ("jax", "numpy", "numba")},
-        "date": time.strftime("%Y-%m-%d"),
-    }
+BENCHMARKS = {
+    "accuracy": accuracy,
+    "trust": trust,
+    "speed": speed,
+    "clique": clique,
+    "stream": stream,
+    "cold": cold,
+    "growth": growth,
+}
 
 
 def write_page() -> None:
@@ -39,23 +30,46 @@ def write_page() -> None:
             continue
         record = json.loads(path.read_text())
         where = ", ".join(f"{k} {v}" for k, v in record["machine"].items())
-        kind = "quick run, " if record["quick"] else ""
-        parts += [f"## {name}", "", module.report(record["rows"]), "", f"*{kind}{where}*", ""]
+        parts += [
+            f"## {name}",
+            "",
+            module.report(record["rows"]),
+            "",
+            record["baseline"],
+            "",
+            f"*{where}*",
+            "",
+        ]
     (HERE / "RESULTS.md").write_text("\n".join(parts))
 
 
 def main() -> None:
+    """The command line; exits with 1 if a metric is worse than its baseline allows."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=list(BENCHMARKS), default=list(BENCHMARKS))
-    parser.add_argument("--quick", action="store_true", help="fewer runs; a look, not a result")
+    parser.add_argument("--quick", action="store_true", help="fewer runs, printed and not kept")
+    parser.add_argument("--update-baseline", action="store_true", help="hold later runs against this one")
     options = parser.parse_args()
+    if options.quick and options.update_baseline:
+        parser.error("a quick run is no baseline: leave out --quick")
+    worse = 0
     for name in options.only:
-        rows = BENCHMARKS[name].run(quick=options.quick)
-        record = {"machine": machine(), "quick": options.quick, "rows": rows}
-        (HERE / "results").mkdir(exist_ok=True)
-        (HERE / "results" / f"{name}.json").write_text(json.dumps(record, indent=1))
-        print(BENCHMARKS[name].report(rows))
-    write_page()
+        module = BENCHMARKS[name]
+        rows = module.run(quick=options.quick)
+        print(module.report(rows), flush=True)
+        if options.quick:
+            continue
+        metrics, where = module.metrics(rows), baseline.machine()
+        if options.update_baseline:
+            baseline.update(name, metrics, where)
+        said, failed = baseline.compare(name, metrics, where)
+        worse += failed
+        print(f"\n{said}\n", flush=True)
+        listed = [m._asdict() for m in metrics]
+        record = {"machine": where, "baseline": said, "metrics": listed, "rows": rows}
+        (HERE / "results" / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n")
+        write_page()
+    sys.exit(worse > 0)
 
 
 if __name__ == "__main__":

@@ -1,258 +1,211 @@
-"""Time and memory of one call, warm and cold, beside the peers in the same run.
+"""The time of one warm call, beside the peers in the same run, on one core and on two.
 
-Problems and methods take turns, so that a noisy minute hits all of them, and medians are reported.
-A cell in which a method gave a wrong answer has no time for it. Everything runs in child processes:
-one on a single core, one on two, one for each first call and for each look at memory.
+Methods take turns on the problems of a cell, so that a noisy minute hits all, and medians are reported.
+A cell in which a method gave a wrong answer has no time for it.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import resource
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+import teaser_jax as tj
+from benchmarks.baseline import Metric, said
+from benchmarks.peers import peers_for
+from benchmarks.problems import Case, protocol, real_pairs
+from benchmarks.processes import available_cores, in_child
+
 CORES = (1, 2)
-CACHE = ("JAX_COMPILATION", "JAX_PERSISTENT")  # variables that keep programs between processes
-# N, share wrong, unknown scale
-FIRST_CALLS = ((1000, 0.95, False), (1000, 0.8, True), (10_000, 0.99, False), (30_000, 0.99, False))
+OURS, GREEDY = "teaser_jax", "teaser_jax, clique='greedy'"
+PATIENCE = 10.0  # seconds that a method may take in a cell before its rounds end
+SETTLE = 0.02  # seconds between two methods: threads of the one before may still spin
+REAL_MEDIAN = 80.0  # milliseconds wanted as the median of the pairs below
+DEFAULT = tj.Settings()
+KISS, TEASER = "kiss-matcher", "TEASER++"
 
-# jax and whatever imports it load in the functions: a first call counts from before that.
+
+class Cell(NamedTuple):
+    """Problems of one kind, and what is wanted there."""
+
+    name: str
+    cases: list[Case]
+    rounds: int
+    milliseconds: float | None = None  # at most so many
+    ratio: float | None = None  # or: at most the time of kiss-matcher divided by this
 
 
-def cells(quick: bool) -> Iterator[tuple[str, list, int]]:
-    """Name, problems and rounds of each cell."""
-    from benchmarks.problems import Case, protocol, real_pairs
-    from teaser_jax import synthetic
-
-    def together(name: str, cases: list, rounds: int) -> tuple[str, list, int]:
-        return name, cases, 1 if quick else rounds
-
-    for n, rates, trials, rounds in (
-        (100, (0.5, 0.7, 0.9), 10, 10),
-        (1000, (0.95, 0.97, 0.99), 5, 10),
-        (5000, (0.95, 0.99), 3, 5),
-        (10_000, (0.99,), 1, 5),
+def cells() -> Iterator[Cell]:
+    """Every cell of the table."""
+    for n, rates, trials, rounds, known in (
+        (100, (0.5, 0.7, 0.9), 10, 20, dict(ratio=1.0)),
+        (1000, (0.95, 0.97, 0.99), 5, 20, dict(ratio=3.0)),
+        (5000, (0.95, 0.99), 3, 7, dict(ratio=5.0)),
+        (10_000, (0.99,), 1, 5, dict(milliseconds=300.0)),
     ):
         for rate in rates:
             name = f"known scale, N = {n}, {round(100 * rate)} % wrong"
-            yield together(name, list(protocol(n, rate, trials)), rounds)
-    for n, rate, trials, rounds in ((100, 0.8, 10, 5), (1000, 0.8, 3, 3), (3000, 0.8, 1, 2)):
-        name = f"unknown scale, N = {n}, {round(100 * rate)} % wrong"
-        yield together(name, list(protocol(n, rate, trials, unknown=True)), rounds)
-    for overlap in (0.2, 0.5, 0.8):
-        p = synthetic.all_to_all(
-            (3, round(10 * overlap)), n=100, overlap=overlap, sigma=0.003, noise_bound=0.01
-        )
-        case = Case("", p.src, p.dst, p.noise_bound, 1.0, p.truth, p.inliers)
-        yield together(f"all to all, {len(p.src)} matches", [case], 5)
+            yield Cell(name, list(protocol(n, rate, trials)), rounds, **known)
+    for n, trials, rounds, most in ((100, 10, 10, None), (1000, 3, 5, 100.0), (3000, 1, 5, 700.0)):
+        name = f"unknown scale, N = {n}, 80 % wrong"
+        yield Cell(name, list(protocol(n, 0.8, trials, unknown=True)), rounds, most)
+    for overlap, most in ((0.2, 50.0), (0.5, 150.0), (0.8, 400.0)):
+        case = all_to_all(overlap)
+        yield Cell(f"all to all, {len(case.src)} matches", [case], 5, most)
     for case in real_pairs():
-        yield together(case.cell, [case], 5)
-        if "mac_demo" in case.cell:
-            yield together(f"{case.cell}, bound 0.1", [replace(case, noise_bound=0.1)], 2)
+        hard = "mac_demo" in case.cell
+        yield Cell(case.cell, [case], 5, 800.0 if hard else None)
+        if hard:
+            wide = f"{case.cell}, bound 0.1"
+            yield Cell(wide, [replace(case, noise_bound=0.1)], 3, 3000.0)
 
 
-def ours(case):
-    """The default call; keeps the answer for its proof."""
-    import teaser_jax as tj
+def all_to_all(overlap: float) -> Case:
+    """100 points against a part of them, every one with every one."""
+    seed = (3, round(10 * overlap))
+    p = tj.synthetic.all_to_all(seed, n=100, overlap=overlap, sigma=0.003, noise_bound=0.01)
+    return Case("", p.src, p.dst, p.noise_bound, 1.0, p.truth, p.inliers)
 
-    ours.result = tj.register(case.src, case.dst, noise_bound=case.noise_bound, scale=case.scale)
-    return ours.result.pose
+
+def ours(case: Case, settings: tj.Settings = DEFAULT) -> tj.Registration:
+    """The call that is measured."""
+    return tj.register(case.src, case.dst, noise_bound=case.noise_bound, scale=case.scale, settings=settings)
 
 
 def warm(quick: bool) -> list[dict]:
     """A row a cell and method: median time of a call, right answers, proved cliques."""
-    from benchmarks.peers import PEERS
-
-    rows = []
-    for name, cases, rounds in cells(quick):
-        peers = {k: solve for k, solve in PEERS.items() if cases[0].scale is not None or k == "TEASER++"}
-        methods = {"teaser_jax": ours, **peers}
-        right, proved = dict.fromkeys(methods, 0), 0
-        for case in cases:  # also compiles
-            for method, solve in methods.items():
-                right[method] += case.is_right(solve(case))
-            proved += bool(ours.result.solution.clique_is_maximum)
-        seconds = {method: [] for method in methods}
-        for _ in range(rounds):
-            for case in cases:
-                for method, solve in methods.items():
-                    start = time.perf_counter()
-                    solve(case)
-                    seconds[method].append(time.perf_counter() - start)
-        for method in methods:
-            rows.append(
-                {
-                    "cell": name,
-                    "method": method,
-                    "trials": len(cases),
-                    "right": right[method],
-                    "proved": proved if method == "teaser_jax" else None,
-                    "milliseconds": 1e3 * float(np.median(seconds[method])),
-                }
-            )
-    return rows
+    return [row for cell in cells() for row in _rows(cell, 1 if quick else cell.rounds)]
 
 
-def stream(quick: bool) -> list[dict]:
-    """A robot's day: pairs of all sizes, one after the other, from the first call on."""
-    import teaser_jax as tj
-    from benchmarks.problems import protocol
-    from teaser_jax.register import before_clique
-
-    rng = np.random.default_rng(0)
-    sizes = np.exp(rng.uniform(np.log(300), np.log(6000), 20 if quick else 200)).astype(int)
-    compiled, milliseconds = before_clique._cache_size(), []
-    for k, n in enumerate(sizes):
-        case = next(protocol(int(n), (0.8, 0.9, 0.95)[k % 3], 1))
-        start = time.perf_counter()
-        tj.register(case.src, case.dst, noise_bound=case.noise_bound)
-        milliseconds.append(1e3 * (time.perf_counter() - start))
-    p50, p99 = np.percentile(milliseconds, [50, 99])
-    return [
-        {
-            "pairs": len(sizes),
-            "p50": p50,
-            "p99": p99,
-            "worst": max(milliseconds),
-            "programs": before_clique._cache_size() - compiled,
-        }
-    ]
-
-
-def first(n: int, rate: float, unknown: bool) -> dict:
-    """Seconds to import and to the first answer of a fresh process, and its memory above an idle one."""
-    start = time.perf_counter()
-    import jax
-
-    import teaser_jax as tj
-    from benchmarks.problems import protocol
-
-    imported = time.perf_counter()
-    case = next(protocol(n, rate, 1, unknown=unknown))
-    jax.block_until_ready(jax.numpy.zeros(1) + 1)
-    idle, ready = _peak(), time.perf_counter()
-    result = tj.register(case.src, case.dst, noise_bound=case.noise_bound, scale=case.scale)
-    return {
-        "import": imported - start,
-        "first": time.perf_counter() - ready,
-        "megabytes": _peak() - idle,
-        "right": case.is_right(result.pose),
+def _rows(cell: Cell, rounds: int) -> Iterator[dict]:
+    greedy = tj.Settings(clique="greedy")
+    methods: dict[str, Callable[[Case], tj.Pose]] = {
+        OURS: lambda case: ours(case).pose,
+        GREEDY: lambda case: ours(case, greedy).pose,
+        **peers_for(cell.cases[0]),
     }
-
-
-def _peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    right = {  # this compiles, too
+        method: sum(case.is_right(solve(case)) for case in cell.cases) for method, solve in methods.items()
+    }
+    proved = sum(bool(ours(case).solution.clique_is_maximum) for case in cell.cases)
+    seconds: dict[str, list[float]] = {method: [] for method in methods}
+    for _ in range(rounds):
+        for method, solve in methods.items():
+            if sum(seconds[method]) > PATIENCE:
+                continue
+            time.sleep(SETTLE)
+            for case in cell.cases:
+                start = time.perf_counter()
+                solve(case)
+                seconds[method].append(time.perf_counter() - start)
+    for method in methods:
+        yield {
+            "cell": cell.name,
+            "method": method,
+            "trials": len(cell.cases),
+            "right": right[method],
+            "proved": proved if method == OURS else None,
+            "milliseconds": 1e3 * float(np.median(seconds[method])),
+            "wanted_ms": cell.milliseconds,
+            "wanted_ratio": cell.ratio,
+        }
 
 
 def run(quick: bool) -> list[dict]:
-    """All parts, each in processes of its own; a row has the name of its part."""
-    rows = []
-    available = len(os.sched_getaffinity(0))
-    for cores in (c for c in CORES if c <= available):
-        rows += [{"part": "warm", "cores": cores, **row} for row in _child("warm", cores, quick)]
-    rows += [{"part": "stream", **row} for row in _child("stream", available, quick)]
-    for n, rate, unknown in FIRST_CALLS:
-        if quick and n > 1000:
-            continue
-        name = f"{'unknown' if unknown else 'known'} scale, N = {n}"
-        part = f"first {n} {rate} {int(unknown)}"
-        rows.append({"part": "first", "cell": name, "cache": "none", **_child(part, available, quick)})
-        if n == 1000:
-            with tempfile.TemporaryDirectory() as folder:
-                keep = {
-                    "JAX_COMPILATION_CACHE_DIR": folder,
-                    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-                }
-                _child(part, available, quick, keep)
-                filled = _child(part, available, quick, keep)
-            rows.append({"part": "first", "cell": name, "cache": "filled", **filled})
-    return rows
+    """The table on one core, and on two where there are two."""
+    chosen = [cores for cores in CORES if cores <= available_cores()]
+    return [{"cores": k, **row} for k in chosen for row in in_child(warm, cores=k, quick=quick)]
 
 
-def _child(part: str, cores: int, quick: bool, variables: dict[str, str] | None = None):
-    """Run a part in a process of its own, on so many cores, without anybody's compilation cache."""
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(CACHE)}
-    chosen = sorted(os.sched_getaffinity(0))[:cores]
-    command = [sys.executable, "-m", "benchmarks.speed", *part.split(), *(["--quick"] if quick else [])]
-    done = subprocess.run(
-        command,
-        env={**environment, **(variables or {}), "OMP_NUM_THREADS": str(cores)},
-        preexec_fn=lambda: os.sched_setaffinity(0, chosen),
-        cwd=Path(__file__).parents[1],
-        stdout=subprocess.PIPE,
-        check=True,
-    )
-    return json.loads(done.stdout.decode().splitlines()[-1])
+class Line(NamedTuple):
+    """What is known of one cell on so many cores: times of those who were right."""
+
+    own: dict
+    times: dict[str, float]
+    wrong: list[str]
+
+    @property
+    def peers(self) -> dict[str, float]:
+        """Times of the others."""
+        return {k: v for k, v in self.times.items() if not k.startswith(OURS)}
+
+    @property
+    def reached(self) -> bool | None:
+        """Whether the cell is as fast as wanted; None where nothing to compare with is known."""
+        own, most, ratio = self.times.get(OURS), self.own["wanted_ms"], self.own["wanted_ratio"]
+        if most is None and ratio is not None and KISS in self.times:
+            most = self.times[KISS] / ratio
+        return None if most is None else own is not None and own <= most
+
+
+def lines_of(rows: list[dict]) -> Iterator[Line]:
+    """The rows of each cell together."""
+    for own in (r for r in rows if r["method"] == OURS):
+        same = [r for r in rows if (r["cell"], r["cores"]) == (own["cell"], own["cores"])]
+        times = {r["method"]: r["milliseconds"] for r in same if r["right"] == r["trials"]}
+        yield Line(own, times, [r["method"] for r in same if r["right"] < r["trials"]])
+
+
+def metrics(rows: list[dict]) -> list[Metric]:
+    """Times of this machine, and ratios to peers, which hold on others."""
+    found = []
+    for line in lines_of(rows):
+        name = f"{line.own['cell']}, cores: {line.own['cores']}"
+        found.append(Metric(f"{name}: right", line.own["right"] / line.own["trials"], "share", "higher", 0.0))
+        found.append(
+            Metric(f"{name}: proved", line.own["proved"] / line.own["trials"], "share", "higher", 0.0)
+        )
+        if OURS in line.times:
+            found.append(Metric(f"{name}: time", line.times[OURS], "ms", "lower", 0.5, portable=False))
+            for peer in (KISS, TEASER):
+                if peer in line.times:
+                    ratio = line.times[peer] / line.times[OURS]
+                    found.append(Metric(f"{name}: {peer} / ours", ratio, "ratio", "higher", 0.3))
+    return found
 
 
 def report(rows: list[dict]) -> str:
-    """Warm calls with their ratio to the fastest peer, the stream, and first calls."""
-    lines = [
-        "Median time of one call, warm; every answer counted is right, others have no time. The ratio is",
-        "that of the fastest peer's time to ours.",
+    """A line a cell, with the ratio to the fastest peer."""
+    text = [
+        "Median time of one warm call; whoever gave a wrong answer in a cell has no time there. `greedy` is",
+        "the same call without the search that proves the clique. The ratio is that of the fastest peer's",
+        "time to ours. Wanted: at most a time, or kiss-matcher's time divided by a number.",
         "",
-        "| cell | cores | teaser_jax [ms] | clique proved | peers [ms] | ratio |",
-        "|---|---|---|---|---|---|",
+        "| cell | cores | teaser_jax [ms] | clique proved | greedy [ms] | peers [ms] | ratio | wanted |",
+        "|---|---|---|---|---|---|---|---|",
     ]
-    warm_rows = [r for r in rows if r["part"] == "warm"]
-    for mine in (r for r in warm_rows if r["method"] == "teaser_jax"):
-        same = [r for r in warm_rows if (r["cell"], r["cores"]) == (mine["cell"], mine["cores"])]
-        times = {r["method"]: r["milliseconds"] for r in same if r["right"] == r["trials"]}
-        peers = {k: v for k, v in times.items() if k != "teaser_jax"}
-        wrong = [f"{r['method']} wrong" for r in same if r["right"] < r["trials"] and r is not mine]
-        beside = ", ".join([*(f"{k} {v:.2f}" for k, v in peers.items()), *wrong]) or "none"
-        own = times.get("teaser_jax")
-        ratio = f"{min(peers.values()) / own:.2f}" if peers and own else ""
-        shown = f"{own:.2f}" if own else "wrong"
-        lines.append(
-            f"| {mine['cell']} | {mine['cores']} | {shown} | {mine['proved']} of {mine['trials']} "
-            f"| {beside} | {ratio} |"
+    for line in lines_of(rows):
+        own, times = line.own, line.times
+        beside = [f"{k} {v:.2f}" for k, v in line.peers.items()]
+        beside += [f"{k} wrong" for k in line.wrong if not k.startswith(OURS)]
+        shown = [f"{times[k]:.2f}" if k in times else "wrong" for k in (OURS, GREEDY)]
+        ratio = f"{min(line.peers.values()) / times[OURS]:.2f}" if line.peers and OURS in times else ""
+        wanted = ""
+        if line.reached is not None:
+            aim = (
+                f"{own['wanted_ms']:.0f} ms"
+                if own["wanted_ms"]
+                else f"kiss-matcher / {own['wanted_ratio']:.0f}"
+            )
+            wanted = f"{aim}: {said(line.reached)}"
+        text.append(
+            f"| {own['cell']} | {own['cores']} | {shown[0]} | {own['proved']} of {own['trials']} "
+            f"| {shown[1]} | {', '.join(beside) or 'none'} | {ratio} | {wanted} |"
         )
-    for row in (r for r in rows if r["part"] == "stream"):
-        lines += [
-            "",
-            f"A stream of {row['pairs']} pairs of 300 to 6000 matches, first calls and compilation "
-            f"included: median {row['p50']:.1f} ms, 99 % within {row['p99']:.0f} ms, "
-            f"the worst {row['worst']:.0f} ms; {row['programs']} sizes compiled.",
-        ]
-    lines += [
-        "",
-        "The first answer of a fresh process, and the peak of its memory above an idle one:",
-        "",
-        "| cell | compilation cache | import [s] | first call [s] | memory [MB] |",
-        "|---|---|---|---|---|",
-    ]
-    for r in (r for r in rows if r["part"] == "first"):
-        lines.append(
-            f"| {r['cell']} | {r['cache']} | {r['import']:.2f} | {r['first']:.2f} | {r['megabytes']:.0f} |"
-        )
-    return "\n".join(lines)
+    for cores in sorted({r["cores"] for r in rows}):
+        scans = [line for line in lines_of(rows) if _is_scan(line.own) and line.own["cores"] == cores]
+        if scans:
+            median = float(np.median([line.times.get(OURS, np.inf) for line in scans]))
+            text += [
+                "",
+                f"Cores: {cores}. Median of the {len(scans)} pairs of KITTI and ETH: {median:.1f} ms "
+                f"(wanted: {REAL_MEDIAN:.0f} ms: {said(median <= REAL_MEDIAN)}).",
+            ]
+    return "\n".join(text)
 
 
-def main() -> None:
-    """One part, its rows as JSON on the last line of the output."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("part", choices=("warm", "stream", "first"))
-    parser.add_argument("numbers", nargs="*")
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
-    if options.part == "first":
-        n, rate, unknown = options.numbers
-        rows = first(int(n), float(rate), bool(int(unknown)))
-    else:
-        rows = {"warm": warm, "stream": stream}[options.part](options.quick)
-    print(json.dumps(rows))
-
-
-if __name__ == "__main__":
-    main()
+def _is_scan(row: dict) -> bool:
+    return "kitti" in row["cell"] or "eth" in row["cell"]

@@ -9,6 +9,7 @@ from itertools import chain
 from scipy.stats import binomtest
 
 import teaser_jax as tj
+from benchmarks.baseline import Metric
 from benchmarks.problems import (
     Case,
     all_wrong,
@@ -18,6 +19,7 @@ from benchmarks.problems import (
     without_correspondences,
 )  # fmt: skip
 
+NAMES = ("problems", "right", "ok", "right_and_ok")
 # Dense graphs of wrong matches would use any budget, and the answer is wrong whatever it is.
 HOPELESS = tj.Settings(clique_seconds=1.0)
 
@@ -51,13 +53,26 @@ def run(quick: bool) -> list[dict]:
         right, ok = case.is_right(result.pose), result.ok
         for i, hit in enumerate((True, right, ok, right and ok)):
             tally[case.cell][i] += hit
-    names = ("problems", "right", "ok", "right_and_ok")
-    return [{"cell": cell, **dict(zip(names, counts, strict=True))} for cell, counts in tally.items()]
+    return [{"cell": cell, **dict(zip(NAMES, counts, strict=True))} for cell, counts in tally.items()]
+
+
+def _total(rows: list[dict]) -> dict[str, int]:
+    return {name: sum(row[name] for row in rows) for name in NAMES}
+
+
+def metrics(rows: list[dict]) -> list[Metric]:
+    """Precision and recall of ``ok``."""
+    total = _total(rows)
+    both = total["right_and_ok"]
+    return [
+        Metric("precision of ok", both / total["ok"], "share", "higher", 0.002),
+        Metric("recall of ok", both / total["right"], "share", "higher", 0.005),
+    ]
 
 
 def report(rows: list[dict]) -> str:
     """Precision and recall with their one-sided 95 % confidence limits, then every cell."""
-    total = {name: sum(row[name] for row in rows) for name in ("problems", "right", "ok", "right_and_ok")}
+    total = _total(rows)
 
     def share(hits: int, of: int) -> str:
         limit = binomtest(hits, of, alternative="greater").proportion_ci(0.95).low

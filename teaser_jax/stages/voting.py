@@ -136,7 +136,7 @@ def running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
     same way. XLA would make log m passes of ``cumsum`` on the CPU, and compile each.
     """
     c, m = x.shape
-    piece = 64
+    piece = 32
     if m <= piece:
         return jnp.matmul(x, np.triu(np.ones((m, m))).astype(x.dtype), precision=lax.Precision.HIGHEST)
     count = -(-m // piece)
