@@ -67,6 +67,7 @@ def main() -> None:
         print(f"\n{said}\n", flush=True)
         listed = [m._asdict() for m in metrics]
         record = {"machine": where, "baseline": said, "metrics": listed, "rows": rows}
+        (HERE / "results").mkdir(exist_ok=True)
         (HERE / "results" / f"{name}.json").write_text(json.dumps(record, indent=1) + "\n")
         write_page()
     sys.exit(worse > 0)
