@@ -153,10 +153,12 @@ def _register(arguments: argparse.Namespace) -> int:
     result = _answer(source, matches, tj.Settings(clique=arguments.clique), known)
     seconds = time.perf_counter() - start
 
+    older = output is not None and output.exists()
     # The words come last: whatever fails before, nothing that counts is out yet.
     _write(result, matches, output, plot)
     if output is not None and not result.ok:
-        print(f"teaser-jax: {output} not written: {result.status.name}", file=sys.stderr)
+        what = "not written, and the older file removed" if older else "not written"
+        print(f"teaser-jax: {output} {what}: {result.status.name}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(_report(result, matches.truth, seconds), allow_nan=False))
     else:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from teaser_jax.types import Pose
 
 TEXT = (".txt", ".csv", ".tsv", ".dat", ".xyz")
+CLOUDS = (".ply", ".pcd", ".las", ".laz", ".bin", ".npy", ".obj", ".stl")  # known to newcomers
 KNOWN = ("noise_bound", "scale", "cbar2", "mask", "confidence", "pairs")
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")  # how archives begin, full and empty ones
 PANDAS_HEADER = ["0", "1", "2", "3", "4", "5"]  # the column names of a table that was given none
@@ -59,10 +60,15 @@ def read_matches(path: str | PathLike[str]) -> Matches:
             raise FileError(f"{path}: is a folder: name the file of matches in it.")
         if path.suffix.lower() not in readers:
             kinds = ", ".join(readers)
+            if path.suffix.lower() in CLOUDS:
+                raise FileError(
+                    f"{path}: is a cloud, and matches are needed: match the two clouds first, and save row i "
+                    f"of one with row i of the other as one of {kinds}."
+                )
             raise FileError(f"{path}: unknown extension '{path.suffix}': give matches as one of {kinds}.")
         return readers[path.suffix.lower()](path)
     except FileNotFoundError:
-        raise FileError(f"{path}: no such file.") from None
+        raise FileError(f"{path}: no such file: check the name.") from None
     except OSError as error:
         raise FileError(f"{path}: cannot be read: {error.strerror or one_line(error)}.") from error
 

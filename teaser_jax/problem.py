@@ -89,6 +89,7 @@ def read_problem(
     cbar2 = _scalar(cbar2, "cbar2")
     scale = None if scale is None else _scale(scale)
     _check_values(src, dst, noise_bound, mask, confidence, dtype)
+    _check_resolution(src, dst, noise_bound, mask, dtype)
 
     def ready(x: Any) -> Any:
         return x.astype(dtype)
@@ -209,12 +210,15 @@ def _points(value: Any, name: str) -> Any:
     shape = array.shape
     if 0 in shape:
         raise ValueError(
-            f"{name} is empty (shape {shape}): an answer that can be trusted needs at least 4 matches (rows)."
+            f"{name} is empty (shape {shape}): an answer that can be trusted needs at least 5 matches (rows)."
         )
     if len(shape) == 2 and shape[0] == 3 and shape[1] != 3:
         raise ValueError(f"{name} has shape {shape}: points are rows, so pass {name}.T of shape (n, 3).")
     if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(f"{name} has shape {shape}: expected (n, 3), one point a row.")
+        raise ValueError(
+            f"{name} has shape {shape}: expected (n, 3), one point a row; pass {name}[:, :3] if more columns "
+            "follow the coordinates."
+        )
     return array
 
 
@@ -230,7 +234,7 @@ def _scalar(value: Any, name: str) -> Any:
     if array.shape != ():
         raise ValueError(f"{name} has shape {array.shape}: expected one number.")
     if not is_traced(array) and not (np.isfinite(array) and array > 0):
-        raise ValueError(f"{name} is {array}: expected a number above 0.")
+        raise ValueError(f"{name} is {array}: give a number above 0.")
     return array
 
 
@@ -284,30 +288,64 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
             )
         if not np.all(np.isfinite(bounds)):
             raise ValueError("noise_bound contains infinity: give the largest error of a right match.")
-    if not is_traced(confidence) and not np.all((confidence >= 0) & np.isfinite(confidence)):
-        raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
+    if not is_traced(confidence, mask):
+        weights = confidence[mask]
+        if not np.all((weights >= 0) & np.isfinite(weights)):
+            raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
     if is_traced(src, dst, mask, noise_bound):
         return
     usable = finite_rows(src, dst, mask)
     if mask.any() and not len(src[usable]):
-        raise ValueError("no row of src and dst is finite: every match holds NaN or infinity.")
-    if len(src[usable]):
-        largest = max(extent(src[usable]), extent(dst[usable]))
-        kind, bound = jnp.finfo(dtype), float(noise_bound[usable].min())
-        # Lengths and bounds appear to the fourth power in the test of edges.
-        most, least = float(kind.max) ** 0.25 / 10, float(kind.tiny) ** 0.25 * 10
-        if max(largest, float(noise_bound[usable].max())) > most or bound < least:
-            raise ValueError(
-                f"coordinates reach {largest:.3g} and noise_bound is {bound:.3g}, beyond what {dtype} can "
-                "square and compare: rescale both to a sensible unit, and look for corrupt rows."
-            )
-        rounding = float(kind.eps) * largest
-        if rounding > 0.01 * bound:
-            wider = "" if dtype == jnp.float64 else ", or use register(), which does that in float64"
-            raise ValueError(
-                f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % "
-                f"of noise_bound {bound:.3g}. Subtract a common origin from each cloud first{wider}."
-            )
+        raise ValueError(
+            "no row of src and dst is finite: every match holds NaN or infinity. Look where they come from; "
+            "give the finite ones."
+        )
+
+
+def _check_resolution(src: Any, dst: Any, noise_bound: Any, mask: Any, dtype: Any) -> None:
+    """Numbers so large, or held in so few digits, that the bound is lost in their rounding."""
+    if is_traced(src, dst, mask, noise_bound):
+        return
+    usable = finite_rows(src, dst, mask)
+    if not len(src[usable]):
+        return
+    largest = max(extent(src[usable]), extent(dst[usable]))
+    kind, bound = jnp.finfo(dtype), float(noise_bound[usable].min())
+    # Lengths and bounds appear to the fourth power in the test of edges.
+    most, least = float(kind.max) ** 0.25 / 10, float(kind.tiny) ** 0.25 * 10
+    if max(largest, float(noise_bound[usable].max())) > most or bound < least:
+        raise ValueError(
+            f"coordinates reach {largest:.3g} and noise_bound is {bound:.3g}, beyond what {dtype} can "
+            f"square and compare: rescale both to a sensible unit{_lonely_row(src, dst, usable, largest)}."
+        )
+    rounding = float(kind.eps) * largest
+    if rounding > 0.01 * bound:
+        wider = "" if dtype == jnp.float64 else ", or use register(), which does that in float64"
+        raise ValueError(
+            f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % of "
+            f"noise_bound {bound:.3g}. Subtract a common origin from each cloud first{wider}"
+            f"{_lonely_row(src, dst, usable, largest)}."
+        )
+    for name, points in (("src", src), ("dst", dst)):
+        if jnp.issubdtype(points.dtype, jnp.floating):
+            lost = float(jnp.finfo(points.dtype).eps) * extent(points[usable])
+            if lost > 0.1 * bound:
+                raise ValueError(
+                    f"{name} is given in {points.dtype}, which resolves {lost:.2g} at coordinates of "
+                    f"{extent(points[usable]):.3g}: more than a tenth of noise_bound {bound:.3g}. The digits "
+                    f"are lost already: subtract the origin before converting to {points.dtype}."
+                )
+
+
+def _lonely_row(src: Any, dst: Any, usable: Any, largest: float) -> str:
+    """Advice, where a single row is what is too large."""
+    reach = np.maximum(np.abs(src).max(axis=1), np.abs(dst).max(axis=1)).astype(np.float64)
+    reach = np.where(np.isin(np.arange(len(src)), np.arange(len(src))[usable]), reach, -1)
+    row = int(np.argmax(reach))
+    usual = float(np.median(reach[reach >= 0]))
+    if usual * 1e3 >= largest:
+        return ""
+    return f". Half of the matches stay within {usual:.3g}: if row {row} is corrupt, mask it"
 
 
 def finite_rows(src: Any, dst: Any, mask: Any) -> np.ndarray | slice:

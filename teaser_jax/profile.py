@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -13,13 +14,15 @@ import numpy as np
 from jaxtyping import Array
 
 from teaser_jax.packing import choices_of, fetched, pack_problem, unpack_solution
-from teaser_jax.problem import finite_rows, pad_problem
+from teaser_jax.problem import finite_rows, is_traced, pad_problem
 from teaser_jax.register import (
+    INSIDE_JIT,
     Registration,
     after_clique,
     between,
     buckets,
     centre,
+    check_settings,
     device_clique,
     edge_dtype,
     host_problem,
@@ -74,8 +77,11 @@ def profile(
     Raises:
         ValueError: As ``register``, and if ``repeats`` is below 1.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats is {repeats}: time each stage at least once, after its first call.")
+    if isinstance(repeats, bool) or not isinstance(repeats, Integral) or repeats < 1:
+        raise ValueError(f"repeats is {repeats!r}: time each stage at least once, after its first call.")
+    check_settings(settings)
+    if is_traced(src, dst, settings, known):
+        raise ValueError(INSIDE_JIT.replace("register", "profile"))
     problem = host_problem(src, dst, **known)
     cold: dict[str, float] = {}
     warm: dict[str, list[float]] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -100,21 +101,21 @@ def register(
             where ``solve`` is the function to use.
         MemoryError: More matches than there is memory for.
     """
-    if not isinstance(settings, Settings):
-        raise ValueError(f"settings is {settings!r}: expected teaser_jax.Settings(...).")
+    check_settings(settings)
     if is_traced(src, dst, noise_bound, scale, cbar2, mask, confidence, pairs, settings):
         raise ValueError(INSIDE_JIT)
     problem = host_problem(
         src, dst, noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
         confidence=confidence, pairs=pairs,
     )  # fmt: skip
-    _check_numbers(settings)
     usable = finite_rows(problem.src, problem.dst, problem.mask)
     centred, origins = centre(problem, usable)
     try:
         solution = _solved(centred, settings, edge_dtype(centred, usable))
     except jax.errors.TracerArrayConversionError as error:  # constants inside somebody's jit
         raise ValueError(INSIDE_JIT) from error
+    except ValueError as error:  # so it is with JAX's options for a compiler, which only a top level has
+        raise (ValueError(INSIDE_JIT) if "compiler_options" in str(error) else error) from error
     except jax.errors.JaxRuntimeError as error:
         if "memory" not in str(error).lower() and "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -151,8 +152,8 @@ def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = S
     Raises:
         ValueError: If ``max_points`` is below 1, or the settings make no sense.
     """
-    if max_points < 1:
-        raise ValueError(f"max_points is {max_points}: expected the largest number of matches to come.")
+    if isinstance(max_points, bool) or not isinstance(max_points, Integral) or max_points < 1:
+        raise ValueError(f"max_points is {max_points!r}: expected the largest number of matches to come.")
     sizes = sorted({bucket(n) for n in range(1, max_points + 1)})
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], float)
     for size in sizes:
@@ -166,8 +167,12 @@ def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = S
     return sizes
 
 
-def _check_numbers(settings: Settings) -> None:
+def check_settings(settings: Settings) -> None:
     """What ``Settings`` cannot check itself, because JAX rebuilds it with placeholders for numbers."""
+    if not isinstance(settings, Settings):
+        raise ValueError(f"settings is {settings!r}: expected teaser_jax.Settings(...).")
+    if is_traced(settings):
+        return
     low, high = settings.scale_range if len(settings.scale_range) == 2 else (None, None)
     numbers = {
         "gnc_factor": (settings.gnc_factor, lambda x: 1 < x < np.inf, "a number above 1"),
@@ -323,11 +328,14 @@ def summary(result: Registration) -> str:
         else "not proved maximum, "
         f"at most {int(s.clique_upper_bound)} (see Settings.clique, clique_seconds, clique_nodes)"
     )
+    searched = f"{int(s.clique_size)} matches agree pairwise, {proof}"
+    if s.clique_size == s.clique_upper_bound and not s.clique_is_maximum:
+        searched = f"not searched: all {int(s.clique_size)} usable matches were taken"
     rows = [
         f"{'ok' if result.ok else 'NOT OK'}: {result.status.name}",
         f"  inliers      {inliers} of {n} matches"
         + (f" ({int(s.excluded)} rows were not finite and left out)" if s.excluded else ""),
-        f"  clique       {int(s.clique_size)} matches agree pairwise, {proof}",
+        f"  clique       {searched}",
         f"  scale        {float(result.pose.scale):.6g}",
         f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) "
         + "("

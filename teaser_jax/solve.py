@@ -66,6 +66,10 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
 
     References: Yang, Shi, Carlone, T-RO 2020, Algorithm 1 with MCIS (section VI-D) and GNC.
     """
+    if problem.src.ndim != 2:
+        raise ValueError(
+            f"src has shape {problem.src.shape}: solve takes one problem; use jax.vmap(solve) for a stack."
+        )
     frozen = lax.stop_gradient(problem)
     graph = prepare(frozen, settings)
     clique = find_clique(frozen, graph, settings)

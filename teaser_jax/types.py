@@ -37,8 +37,8 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.OK: "The pose is determined by its inliers, and they agree better than chance allows.",
     Status.TOO_FEW_POINTS: (
-        "Fewer than 3 usable matches: check for non-finite rows, the mask and the confidences, "
-        "or give more matches."
+        "Fewer than 3 usable matches: check for non-finite rows, the mask and the confidences, and that "
+        "noise_bound, cbar2 and scale are numbers above 0; or give more matches."
     ),
     Status.NO_CONSENSUS: (
         "No set of matches agrees better than wrong matches would by chance: check that the two "
@@ -140,8 +140,15 @@ class Settings:
                 raise ValueError(f"Settings.{name} is {getattr(self, name)!r}: expected one of {allowed}.")
         for name in ("gnc_iterations", "refine_iterations", "clique_nodes"):
             cap = getattr(self, name)
-            if isinstance(cap, bool) or not isinstance(cap, Integral) or cap <= 0:
-                raise ValueError(f"Settings.{name} is {cap!r}: expected a whole number above 0.")
+            if isinstance(cap, bool) or not isinstance(cap, Integral) or not 0 < int(cap) < 2**31:
+                raise ValueError(f"Settings.{name} is {cap!r}: expected a whole number from 1 to 2^31 - 1.")
+        if not isinstance(self.refine, bool):
+            raise ValueError(f"Settings.refine is {self.refine!r}: expected True or False.")
+        if isinstance(self.gnc_factor, str) or isinstance(self.gnc_tolerance, str):
+            raise ValueError(
+                f"Settings.gnc_factor and gnc_tolerance are {self.gnc_factor!r} and {self.gnc_tolerance!r}: "
+                "expected numbers."
+            )
         if isinstance(self.gnc_factor, float | int) and not self.gnc_factor > 1:
             raise ValueError(f"Settings.gnc_factor is {self.gnc_factor!r}: expected a number above 1.")
         if not isinstance(self.scale_range, tuple) or len(self.scale_range) != 2:
@@ -198,7 +205,9 @@ class Pose:
         return so3.quat_from_rotation(self.rotation)
 
     def apply(self, points: Float[AnyArray, "*batch n 3"]) -> Float[AnyArray, "*batch n 3"]:
-        """Source points (rows) in the target frame."""
+        """Source points (rows) in the target frame. Raises ValueError on other shapes than (..., n, 3)."""
+        if points.ndim < 2 or points.shape[-1] != 3:
+            raise ValueError(f"points have shape {points.shape}: expected (n, 3), one point a row.")
         rotated = so3.rotate(self.rotation, points)
         return self.scale[..., None, None] * rotated + self.translation[..., None, :]
 
@@ -285,7 +294,7 @@ class Solution:
         status: A ``Status`` as int32; the first failure sticks.
         clique_size: Members of the clique.
         clique_upper_bound: No clique of the consistency graph is larger: proved.
-        clique_is_maximum: Whether the two are equal, which proves the maximum.
+        clique_is_maximum: Whether the two are equal, which proves the maximum; never without pruning.
         excluded: Rows left out because they hold NaN or infinity.
         cost: The joint cost (6) of the pose [-].
     """

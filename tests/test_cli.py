@@ -119,7 +119,7 @@ def test_no_trustworthy_answer_leaves_no_pose_behind(wrong, tmp_path, capsys):
     assert cli.main([str(a) for a in arguments]) == 1
     out, err = capsys.readouterr()
     assert out.startswith("NOT OK: ")
-    assert err == f"teaser-jax: {output} not written: {out.split()[2]}\n"
+    assert err == f"teaser-jax: {output} not written, and the older file removed: {out.split()[2]}\n"
     assert not output.exists()
     assert plot.exists()
     assert cli.main(["register", str(wrong), "--noise-bound", "0.0554", "--json"]) == 1

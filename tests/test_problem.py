@@ -54,7 +54,7 @@ BAD_POINTS = {
     "unequal lengths": (dict(dst=GOOD[:5]), r"8 rows and dst has 5.*rows are matches.*Match the clouds"),
     "columns as points": (dict(src=GOOD.T, dst=GOOD.T), r"\(3, 8\).*points are rows.*src\.T"),
     "target as columns": (dict(dst=GOOD.T), r"dst has shape \(3, 8\).*dst\.T"),
-    "no rows": (dict(src=np.zeros((0, 3)), dst=np.zeros((0, 3))), r"empty.*trusted needs at least 4 matches"),
+    "no rows": (dict(src=np.zeros((0, 3)), dst=np.zeros((0, 3))), r"empty.*trusted needs at least 5 matches"),
     "empty lists": (dict(src=[], dst=[]), r"src is empty"),
     "two columns": (dict(src=GOOD[:, :2]), r"\(8, 2\).*expected \(n, 3\)"),
     "one point": (dict(src=[1.0, 2.0, 3.0]), r"\(3,\).*expected \(n, 3\)"),
@@ -349,3 +349,32 @@ def test_padding_refuses_to_cut():
 def test_padding_keeps_numpy_on_the_host():
     problem = jax.tree.map(np.asarray, make())
     assert all(isinstance(x, np.ndarray) for x in jax.tree.leaves(pad_problem(problem, 16)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda src: (src + 1e6).astype(np.float32), r"given in float32.*before converting"),
+        (lambda src: np.concatenate([src[:-1], [[1e13, 0, 0]]]), r"if row 9 is corrupt, mask it"),
+        (lambda src: np.concatenate([src[:-1], [[1e300, 0, 0]]]), r"if row 9 is corrupt, mask it"),
+    ],
+)
+def test_digits_that_are_lost_are_named(change, words):
+    points = np.random.default_rng(0).uniform(size=(10, 3))
+    with pytest.raises(ValueError, match=words):
+        tj.register(change(points), points, noise_bound=0.01)
+
+
+def test_what_is_masked_is_not_looked_at():
+    points = np.random.default_rng(0).uniform(size=(10, 3))
+    odd = points.copy()
+    odd[3] = 1e300
+    weights = np.where(np.arange(10) == 3, np.nan, 1.0)
+    known = dict(noise_bound=0.01, mask=np.arange(10) != 3, confidence=weights)
+    assert tj.register(odd, points, **known).ok
+
+
+def test_a_stack_wants_vmap():
+    problem = tj.make_problem(np.ones((5, 3)), np.ones((5, 3)), noise_bound=0.1)
+    with pytest.raises(ValueError, match="vmap"):
+        tj.solve(tj.stack_problems([problem, problem]))

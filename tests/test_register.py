@@ -212,7 +212,7 @@ def test_after_warmup_nothing_compiles(most, stream):
     listening.clear()
 
 
-@pytest.mark.parametrize("max_points", [0, -3])
+@pytest.mark.parametrize("max_points", [0, -3, 1.5, "10", None, float("nan")])
 def test_warmup_wants_a_size(max_points):
     with pytest.raises(ValueError, match="max_points"):
         tj.warmup(max_points)
@@ -272,7 +272,7 @@ def test_a_result_is_as_true_as_its_ok(problem, result):
 
 def test_on_constants_inside_jit_it_names_the_function_to_use_too(problem):
     inside = lambda x: x * tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound).pose.scale
-    with pytest.raises(ValueError, match="solve"):
+    with pytest.raises(ValueError, match=r"register was called inside jit.*solve"):
         jax.jit(inside)(2.0)
 
 
@@ -292,11 +292,16 @@ def test_on_constants_inside_jit_it_names_the_function_to_use_too(problem):
         lambda: tj.Settings(clique_seconds=None),
         lambda: tj.Settings(clique_nodes=True),
         lambda: tj.Settings(clique="best"),
+        lambda: tj.Settings(refine="no"),
+        lambda: tj.Settings(refine=None),
+        lambda: tj.Settings(gnc_factor="2"),
+        lambda: tj.Settings(gnc_iterations=2**31),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(problem, settings):
-    with pytest.raises(ValueError, match=r"[Ss]ettings.*expected"):
-        tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound, settings=settings())
+    for call in (tj.register, tj.profile):
+        with pytest.raises(ValueError, match=r"[Ss]ettings.*expected"):
+            call(problem.src, problem.dst, noise_bound=problem.noise_bound, settings=settings())
 
 
 def test_too_many_matches_are_a_memory_error_with_advice(problem, monkeypatch):

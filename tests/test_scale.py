@@ -209,3 +209,15 @@ def test_float32_points_vote_in_float64():
         assert narrow.dtype == jnp.float32
         assert not jax.config.jax_enable_x64
     assert float(narrow) == pytest.approx(float(wide), rel=1e-7)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+@pytest.mark.parametrize("hub", [20, 60])
+def test_many_to_one_matches_do_not_vote_the_scale_to_zero(jitter, hub):
+    rng = np.random.default_rng(0)
+    src = rng.normal(size=(20 + hub, 3))
+    dst = 1.7 * src
+    dst[20:] = dst[0] + jitter * rng.normal(size=(hub, 3))
+    scale, chosen = estimate(src, dst, np.full(20 + hub, 0.01), np.ones(20 + hub, bool))
+    assert float(scale) == pytest.approx(1.7, rel=1e-2)
+    assert not unpack(chosen, 20 + hub)[20:, 20:].any()

@@ -164,3 +164,15 @@ def test_a_scale_out_of_its_range_has_no_consensus():
     }.items():
         settings = tj.Settings(scale_range=scale_range)
         assert status(problem.src, problem.dst, settings=settings, **known) == expected
+
+
+@pytest.mark.parametrize("flat", [1.0, 0.3, 0.1])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_flat_cloud_mirrored_has_no_pose_either(flat, axis):
+    # Its flat parts fit a rotation by themselves: those alone are no answer.
+    rng = np.random.default_rng(axis)
+    parts = np.concatenate([cloud(60) * [1, 1, 0.01], cloud(90, 2) * [1, 1, flat]])
+    src = parts @ random_rotation(rng).T
+    mirror = np.where(np.arange(3) == axis, -1, 1)
+    assert status(src, moved(src)) == tj.Status.OK
+    assert status(src, moved(src * mirror)) == tj.Status.NO_CONSENSUS

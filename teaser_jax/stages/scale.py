@@ -44,6 +44,10 @@ def estimate_scale(
     Runs in float64 whatever the dtype of the points, because running sums of a million terms
     cancel; JAX's configuration is left as it was.
 
+    A pair whose target length is within its bound agrees with a scale of zero: it cannot tell a scale
+    from a collapse and does not vote. Otherwise matches that are many to one, whose lengths are zero
+    exactly, would outvote the right ones from a third of all matches on.
+
     Returns:
         Scale [-] in the dtype of the points, 0 where nothing can vote, and the pairs that agree
         with it: packed bit rows, or a mask of the given pairs.
@@ -60,11 +64,11 @@ def estimate_scale(
         if pairs is not None:
             values, bounds = trims(tims(src, pairs), tims(dst, pairs), tim_bounds(noise_bound, pairs))
             won = vote(
-                values, bounds, mask=usable_pairs(pairs, mask),
+                values, bounds, mask=usable_pairs(pairs, mask) & (values > jnp.sqrt(cbar2) * bounds),
                 cbar2=cbar2, criterion=criterion, interval=(low, high),
             )  # fmt: skip
             return won.estimate.astype(dtype), won.members
-        every = CompleteTrims(src, dst, noise_bound, mask)
+        every = CompleteTrims(src, dst, noise_bound, mask, cbar2)
         if criterion == "tls" and every.rows * every.length > FEW_PAIRS:
             found, witness = vote_by_histogram(every, cbar2=cbar2, unit=every.typical(), interval=(low, high))
         else:
@@ -125,7 +129,8 @@ def _columns(values: Float[Array, " n"], lane: Int[Array, ""]) -> Float[Array, "
 class CompleteTrims:
     """The TRIMs of every unordered pair once: row k holds the pairs (i, i + k + 1 mod n)."""
 
-    def __init__(self, src: Array, dst: Array, noise_bound: Array, mask: Array) -> None:
+    def __init__(self, src: Array, dst: Array, noise_bound: Array, mask: Array, cbar2: Array) -> None:
+        self.cbar2 = cbar2
         self.length = src.shape[0]
         self.rows = self.length // 2
         self.matches = tuple(jnp.asarray(x) for x in (*src.T, *dst.T, noise_bound, mask))
@@ -157,16 +162,17 @@ class CompleteTrims:
     def _trims(self, k: Array, i: Array, these: Any, others: Any) -> tuple[Array, Array, Array]:
         difference = [y - x for x, y in zip(these[:6], others[:6], strict=True)]
         a2, b2 = squared_norm(tuple(difference[:3])), squared_norm(tuple(difference[3:]))
-        voters = these[7] & others[7] & (a2 > 0)
+        bound = these[6] + others[6]
+        voters = these[7] & others[7] & (a2 > 0) & (b2 > self.cbar2 * bound**2)
         voters &= (2 * (k + 1) != self.length) | (i < self.rows)  # half way round, pairs would come twice
         inverse = 1 / jnp.sqrt(jnp.where(voters, a2, 1))
-        return jnp.sqrt(b2) * inverse, (these[6] + others[6]) * inverse, voters
+        return jnp.sqrt(b2) * inverse, bound * inverse, voters
 
 
 def _agreeing_pairs(
     src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
 ) -> tuple[Float[Array, ""], UInt32[Array, "n w"]]:
-    """The pairs with | |b_ij| - s |a_ij| | <= c delta_ij and a length to divide by, as bit rows.
+    """The pairs that vote and have | |b_ij| - s |a_ij| | <= c delta_ij, as bit rows.
 
     Also their weighted mean (14), as sum w |a||b| / sum w |a|^2 with w = 1 / delta^2.
     """
@@ -177,6 +183,7 @@ def _agreeing_pairs(
         a2, b2 = squared_norm(visited.src_tims), squared_norm(visited.dst_tims)
         a, b = jnp.sqrt(a2), jnp.sqrt(b2)
         agree = (jnp.abs(b - scale * a) <= c * visited.bounds) & visited.valid & (a2 > 0)
+        agree &= b > c * visited.bounds
         weight = jnp.where(agree, 1 / visited.bounds**2, 0)
         rows |= agree.astype(jnp.uint32) << lane.astype(jnp.uint32)
         return rows, above + jnp.sum(weight * a * b), below + jnp.sum(weight * a2)
