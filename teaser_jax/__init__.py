@@ -1,6 +1,9 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
 
 from teaser_jax import files, metrics, plots, so3, synthetic
+from teaser_jax.certify.pose import certify
+from teaser_jax.certify.rotation import Certificate, CertificateStatus, CertifiedBy, certify_rotation
+from teaser_jax.certify.verify import verify
 from teaser_jax.problem import make_problem, stack_problems
 from teaser_jax.profile import Profile, profile
 from teaser_jax.register import Registration, register, warmup
@@ -10,7 +13,8 @@ from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Statu
 __version__ = "0.1.0"
 
 __all__ = [
-    "Pose", "Problem", "Profile", "Registration", "Selection", "Settings", "Solution", "Status",
-    "files", "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "so3",
-    "solve", "stack_problems", "synthetic", "warmup",
+    "Certificate", "CertificateStatus", "CertifiedBy", "Pose", "Problem", "Profile", "Registration",
+    "Selection", "Settings", "Solution", "Status",
+    "certify", "certify_rotation", "files", "make_problem", "metrics", "plots", "profile", "refit",
+    "register", "select", "so3", "solve", "stack_problems", "synthetic", "verify", "warmup",
 ]  # fmt: skip

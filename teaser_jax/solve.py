@@ -235,6 +235,11 @@ def refit(problem: Problem, selection: Selection) -> Pose:
     )
 
 
+def cascade_pose(problem: Problem, selection: Selection) -> Pose:
+    """What ``refit`` would give without refinement: the paper's plain cascade on the same sets."""
+    return _refit(problem, selection, refined=False)
+
+
 def _refit(problem: Problem, selection: Selection, *, refined: bool) -> Pose:
     p, _ = usable_rows(problem)
     if refined:

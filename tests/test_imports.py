@@ -19,7 +19,10 @@ ORDER = [
     "stages.consistency",
     "stages.clique_reduction", "stages.clique_branching", "stages.clique", "stages.clique_search",
     "stages.rotation", "stages.translation", "stages.refinement", "stages.trust",
-    "problem", "solve", "packing", "register", "profile",
+    "problem", "solve",
+    "certify.quadratic_form", "certify.dual", "certify.projection", "certify.splitting", "certify.rotation",
+    "certify.pose", "certify.verify",
+    "packing", "register", "profile",
     "metrics", "synthetic", "files", "plots", "cli",
 ]  # fmt: skip
 # The search returns to the module that calls it for one thing: networkx, where numba cannot be had.

@@ -1,0 +1,88 @@
+"""The robust rotation problem as a quadratic form in a quaternion and its clones (problem (19)).
+
+With q the quaternion of a rotation, scalar last, and theta_k = +1 for an inlier and -1 for an outlier,
+the cost sum_k min(|b_k - R a_k|^2, c^2) is x^T Q x at x = [q; theta_1 q; ...; theta_K q]. Everything here
+is written in the frame of a candidate, a_k against R^T b_k, in which the candidate is the identity and
+its quaternion (0, 0, 0, 1). Measurements are in units of their noise bounds, so that c is one number.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from teaser_jax import so3
+
+
+class Measurements(NamedTuple):
+    """Vector pairs in the frame of a candidate rotation, in units of their noise bounds.
+
+    Attributes:
+        src: a_k.
+        dst: R^T b_k.
+        cbar2: Truncation of the squared residual [-].
+        mask: Measurements that exist; the others hold zeros.
+    """
+
+    src: Float[Array, "k 3"]
+    dst: Float[Array, "k 3"]
+    cbar2: Float[Array, ""]
+    mask: Bool[Array, " k"]
+
+    @property
+    def residuals(self) -> Float[Array, "k 3"]:
+        """b_k - a_k."""
+        return self.dst - self.src
+
+    @property
+    def inliers(self) -> Bool[Array, " k"]:
+        """Where theta is +1."""
+        return self.mask & (jnp.sum(self.residuals**2, axis=1) <= self.cbar2)
+
+    @property
+    def cost(self) -> Float[Array, ""]:
+        """The truncated cost of the candidate [-]."""
+        r2 = jnp.sum(self.residuals**2, axis=1)
+        return jnp.sum(jnp.where(self.mask, jnp.minimum(r2, self.cbar2), 0))
+
+    def turned(self, rotation: Float[Array, "3 3"]) -> Measurements:
+        """The same in the frame of another candidate, given from this one's."""
+        return self._replace(dst=so3.rotate(rotation.T, self.dst))
+
+
+def pair_matrix(src: Float[Array, "k 3"], dst: Float[Array, "k 3"]) -> Float[Array, "k 4 4"]:
+    """The symmetric P with q^T P q = b . R(q) a for every unit quaternion q, scalar last."""
+    outer = dst[:, :, None] * src[:, None, :]
+    inner = jnp.trace(outer, axis1=1, axis2=2)
+    top = outer + jnp.swapaxes(outer, 1, 2) - inner[:, None, None] * jnp.eye(3, dtype=src.dtype)
+    cross = jnp.cross(src, dst)
+    top = jnp.concatenate([top, cross[:, :, None]], axis=2)
+    bottom = jnp.concatenate([cross, inner[:, None]], axis=1)[:, None, :]
+    return jnp.concatenate([top, bottom], axis=1)
+
+
+def cost_blocks(m: Measurements) -> tuple[Float[Array, "k 4 4"], Float[Array, "k 4 4"]]:
+    """H+ and H-, with q^T H q = (r^2 +- c^2) / 2; zero for measurements that do not exist.
+
+    The cost of a measurement is q^T H+ q + theta q^T H- q.
+    """
+    size = 0.5 * (jnp.sum(m.src**2, axis=1) + jnp.sum(m.dst**2, axis=1))
+    eye = jnp.eye(4, dtype=m.src.dtype)
+    both = size[:, None, None] * eye - pair_matrix(m.src, m.dst)
+    exists, half = m.mask[:, None, None], 0.5 * m.cbar2 * eye
+    return jnp.where(exists, both + half, 0), jnp.where(exists, both - half, 0)
+
+
+def cost_matrix(m: Measurements) -> Float[Array, "n4 n4"]:
+    """Q, gauge-fixed: the clones are theta_k q, so the blocks (0, k) carry theta_k."""
+    plus, minus = cost_blocks(m)
+    k = plus.shape[0]
+    theta = jnp.where(m.inliers, 1, -1).astype(m.src.dtype)[:, None, None]
+    index = jnp.arange(1, k + 1)
+    blocks = jnp.zeros((k + 1, 4, k + 1, 4), m.src.dtype)
+    blocks = blocks.at[index, :, index, :].set(plus)
+    blocks = blocks.at[0, :, index, :].set(0.5 * theta * minus)
+    blocks = blocks.at[index, :, 0, :].set(0.5 * theta * minus)
+    return blocks.reshape(4 * k + 4, 4 * k + 4)
