@@ -114,8 +114,10 @@ def register(
         solution = _solved(centred, settings, edge_dtype(centred, usable))
     except jax.errors.TracerArrayConversionError as error:  # constants inside somebody's jit
         raise ValueError(INSIDE_JIT) from error
-    except ValueError as error:  # so it is with JAX's options for a compiler, which only a top level has
-        raise (ValueError(INSIDE_JIT) if "compiler_options" in str(error) else error) from error
+    except ValueError as error:
+        if "compiler_options" not in str(error):  # which JAX takes at the top level only
+            raise
+        raise ValueError(INSIDE_JIT) from error
     except jax.errors.JaxRuntimeError as error:
         if "memory" not in str(error).lower() and "RESOURCE_EXHAUSTED" not in str(error):
             raise
