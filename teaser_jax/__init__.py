@@ -1,8 +1,9 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
 
 from teaser_jax import files, metrics, plots, so3, synthetic
+from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
 from teaser_jax.certify.pose import certify
-from teaser_jax.certify.rotation import Certificate, CertificateStatus, CertifiedBy, certify_rotation
+from teaser_jax.certify.rotation import certify_rotation
 from teaser_jax.certify.verify import verify
 from teaser_jax.problem import make_problem, stack_problems
 from teaser_jax.profile import Profile, profile

@@ -20,8 +20,8 @@ ORDER = [
     "stages.clique_reduction", "stages.clique_branching", "stages.clique", "stages.clique_search",
     "stages.rotation", "stages.translation", "stages.refinement", "stages.trust",
     "problem", "solve",
-    "certify.quadratic_form", "certify.dual", "certify.projection", "certify.splitting", "certify.rotation",
-    "certify.pose", "certify.verify",
+    "certify.quadratic_form", "certify.dual", "certify.projection", "certify.splitting",
+    "certify.certificate", "certify.rotation", "certify.pose", "certify.verify",
     "packing", "register", "profile",
     "metrics", "synthetic", "files", "plots", "cli",
 ]  # fmt: skip

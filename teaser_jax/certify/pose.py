@@ -11,12 +11,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from teaser_jax.certify.certificate import Certificate, CertificateStatus
 from teaser_jax.certify.rotation import (
     ITERATIONS,
     MAX_MEASUREMENTS,
     TOLERANCE,
-    Certificate,
-    CertificateStatus,
     CertifyMethod,
     certify_rotation,
 )  # fmt: skip

@@ -10,8 +10,6 @@ A proof speaks of these measurements: it says optimal, never right.
 
 from __future__ import annotations
 
-import enum
-from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -22,7 +20,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.certify.dual import Dual, coupled_guess, dual_matrix, dual_of
+from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.certify.dual import coupled_guess, dual_matrix, dual_of
 from teaser_jax.certify.projection import smallest_eigenvalue
 from teaser_jax.certify.quadratic_form import Measurements
 from teaser_jax.certify.splitting import existing, reaches, reference, rounding, split
@@ -39,108 +38,6 @@ ABSOLUTE_TOLERANCE = 1e-6
 CURVATURES = (1e-2, 1e-4)
 
 CertifyMethod = Literal["splitting", "direct", "reference"]
-
-
-class CertificateStatus(enum.IntEnum):
-    """What a certificate came to. Held as int32 inside JAX."""
-
-    OPTIMAL = 0
-    UNKNOWN = 1
-    SUBOPTIMAL = 2
-    UNDECIDABLE = 3
-    TOO_LARGE = 4
-    NO_MEASUREMENTS = 5
-
-    @property
-    def advice(self) -> str:
-        """One sentence: what is proved, and what to try."""
-        return _ADVICE[self]
-
-
-_ADVICE = {
-    CertificateStatus.OPTIMAL: "No rotation fits these measurements better, beyond the stated gap.",
-    CertificateStatus.UNKNOWN: (
-        "Neither proved nor refuted: the rotation may still be the best. Measurements whose residual is near "
-        "the bound, or very many wrong ones, do that; more iterations may help."
-    ),
-    CertificateStatus.SUBOPTIMAL: (
-        "A better rotation for these measurements is known: Certificate.rotation holds it."
-    ),
-    CertificateStatus.UNDECIDABLE: (
-        "The gap asked for is below what float64 resolves for these measurements: their noise bounds are "
-        "tiny against their lengths; ask for a larger tolerance."
-    ),
-    CertificateStatus.TOO_LARGE: (
-        "More measurements than max_measurements: raise it, or certify outside jit, where sizes are exact."
-    ),
-    CertificateStatus.NO_MEASUREMENTS: "There is nothing to certify: no usable measurement.",
-}
-
-
-class CertifiedBy(enum.IntEnum):
-    """How the bound was found."""
-
-    NOTHING = 0
-    ZERO_COST = 1
-    DIRECT = 2
-    SPLITTING = 3
-    REFERENCE = 4
-
-
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "cost", "lower_bound", "suboptimality", "absolute_gap", "is_optimal", "is_unique", "angle_bound",
-        "iterations", "method", "status", "rotation", "angle", "dual", "inlier_gap", "explained_gap",
-    ],
-    meta_fields=[],
-)  # fmt: skip
-@dataclass(frozen=True, repr=False)
-class Certificate:
-    """What is proved of a rotation, given its measurements. False until proved.
-
-    Attributes:
-        cost: Truncated least squares cost of the rotation that was given [-].
-        lower_bound: No rotation costs less: proved [-].
-        suboptimality: (cost - lower_bound) / cost; at most this share could be saved [-].
-        absolute_gap: The same difference over the cost of calling everything an outlier [-].
-        is_optimal: Whether the suboptimality is within the tolerance.
-        is_unique: Whether no other rotation reaches the lower bound.
-        angle_bound: Every rotation that costs no more lies within this angle; infinite: none follows [rad].
-        iterations: Rounds of the splitting.
-        method: A ``CertifiedBy`` as int32.
-        status: A ``CertificateStatus`` as int32.
-        rotation: The given rotation, polished: least squares on its own inliers.
-        angle: Between the given rotation and the polished one [rad].
-        dual: The proof: with the measurements and ``rotation`` it can be checked by ``verify``.
-        inlier_gap: No pose explains more than so many matches beyond this one's; None without a clique.
-        explained_gap: 0: the pose explains all that can be explained; 1: nothing; None without a clique.
-    """
-
-    cost: Float[AnyArray, ""]
-    lower_bound: Float[AnyArray, ""]
-    suboptimality: Float[AnyArray, ""]
-    absolute_gap: Float[AnyArray, ""]
-    is_optimal: Bool[AnyArray, ""]
-    is_unique: Bool[AnyArray, ""]
-    angle_bound: Float[AnyArray, ""]
-    iterations: Int[AnyArray, ""]
-    method: Int[AnyArray, ""]
-    status: Int[AnyArray, ""]
-    rotation: Float[AnyArray, "3 3"]
-    angle: Float[AnyArray, ""]
-    dual: Dual
-    inlier_gap: Int[AnyArray, ""] | None = None
-    explained_gap: Float[AnyArray, ""] | None = None
-
-    def __repr__(self) -> str:
-        if isinstance(self.status, jax.core.Tracer) or np.shape(self.status) != ():
-            return f"Certificate(status={self.status!r})"
-        status, by = CertificateStatus(int(self.status)), CertifiedBy(int(self.method))
-        return (
-            f"Certificate({status.name}, suboptimality <= {float(self.suboptimality):.3g}, "
-            f"by {by.name.lower()}, iterations={int(self.iterations)})"
-        )
 
 
 def certify_rotation(
@@ -367,21 +264,14 @@ def read_off(m: Measurements, frame: Float[Array, "3 3"], claim: Claim, attempt:
     angle = so3.rotation_angle(claim.turn)
     within = angle_bound + angle
     resolved = claim.shift > 2 * error
-    status = jnp.where(
-        ~some,
-        jnp.int32(CertificateStatus.NO_MEASUREMENTS),
-        jnp.where(
-            claim.allowance <= 0,
-            jnp.int32(CertificateStatus.SUBOPTIMAL),
-            jnp.where(
-                optimal,
-                jnp.int32(CertificateStatus.OPTIMAL),
-                jnp.where(
-                    resolved, jnp.int32(CertificateStatus.UNKNOWN), jnp.int32(CertificateStatus.UNDECIDABLE)
-                ),
-            ),
-        ),
-    )
+    status = jnp.int32(CertificateStatus.UNKNOWN)
+    for holds, what in (
+        (~resolved, CertificateStatus.UNDECIDABLE),
+        (optimal, CertificateStatus.OPTIMAL),
+        (claim.allowance <= 0, CertificateStatus.SUBOPTIMAL),
+        (~some, CertificateStatus.NO_MEASUREMENTS),
+    ):
+        status = jnp.where(holds, jnp.int32(what), status)
     return Certificate(
         cost=claim.given,
         lower_bound=lower,
@@ -488,4 +378,4 @@ def _outside_jit(
         found, state = _first_program(*rows, np.float64(tolerance), rounds)
         if method == "splitting" and int(found.status) == CertificateStatus.UNKNOWN:
             found = _second_program(*state, iterations=iterations)
-        return replace(jax.device_get(found))
+        return jax.device_get(found)

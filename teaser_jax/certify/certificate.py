@@ -1,0 +1,116 @@
+"""What is proved of a rotation: the certificate and its words."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from teaser_jax.certify.dual import Dual
+from teaser_jax.so3 import AnyArray
+
+
+class CertificateStatus(enum.IntEnum):
+    """What a certificate came to. Held as int32 inside JAX."""
+
+    OPTIMAL = 0
+    UNKNOWN = 1
+    SUBOPTIMAL = 2
+    UNDECIDABLE = 3
+    TOO_LARGE = 4
+    NO_MEASUREMENTS = 5
+
+    @property
+    def advice(self) -> str:
+        """One sentence: what is proved, and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    CertificateStatus.OPTIMAL: "No rotation fits these measurements better, beyond the stated gap.",
+    CertificateStatus.UNKNOWN: (
+        "Neither proved nor refuted: the rotation may still be the best. Measurements whose residual is near "
+        "the bound, or very many wrong ones, do that; more iterations may help."
+    ),
+    CertificateStatus.SUBOPTIMAL: (
+        "A better rotation for these measurements is known: Certificate.rotation holds it."
+    ),
+    CertificateStatus.UNDECIDABLE: (
+        "The gap asked for is below what float64 resolves for these measurements: their noise bounds are "
+        "tiny against their lengths; ask for a larger tolerance."
+    ),
+    CertificateStatus.TOO_LARGE: (
+        "More measurements than max_measurements: raise it, or certify outside jit, where sizes are exact."
+    ),
+    CertificateStatus.NO_MEASUREMENTS: "There is nothing to certify: no usable measurement.",
+}
+
+
+class CertifiedBy(enum.IntEnum):
+    """How the bound was found."""
+
+    NOTHING = 0
+    ZERO_COST = 1
+    DIRECT = 2
+    SPLITTING = 3
+    REFERENCE = 4
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "cost", "lower_bound", "suboptimality", "absolute_gap", "is_optimal", "is_unique", "angle_bound",
+        "iterations", "method", "status", "rotation", "angle", "dual", "inlier_gap", "explained_gap",
+    ],
+    meta_fields=[],
+)  # fmt: skip
+@dataclass(frozen=True, repr=False)
+class Certificate:
+    """What is proved of a rotation, given its measurements. False until proved.
+
+    Attributes:
+        cost: Truncated least squares cost of the rotation that was given [-].
+        lower_bound: No rotation costs less: proved [-].
+        suboptimality: (cost - lower_bound) / cost; at most this share could be saved [-].
+        absolute_gap: The same difference over the cost of calling everything an outlier [-].
+        is_optimal: Whether the suboptimality is within the tolerance.
+        is_unique: Whether no other rotation reaches the lower bound.
+        angle_bound: Every rotation that costs no more lies within this angle; infinite: none follows [rad].
+        iterations: Rounds of the splitting.
+        method: A ``CertifiedBy`` as int32.
+        status: A ``CertificateStatus`` as int32.
+        rotation: The given rotation, polished: least squares on its own inliers.
+        angle: Between the given rotation and the polished one [rad].
+        dual: The proof: with the measurements and ``rotation`` it can be checked by ``verify``.
+        inlier_gap: No pose explains more than so many matches beyond this one's; None without a clique.
+        explained_gap: 0: the pose explains all that can be explained; 1: nothing; None without a clique.
+    """
+
+    cost: Float[AnyArray, ""]
+    lower_bound: Float[AnyArray, ""]
+    suboptimality: Float[AnyArray, ""]
+    absolute_gap: Float[AnyArray, ""]
+    is_optimal: Bool[AnyArray, ""]
+    is_unique: Bool[AnyArray, ""]
+    angle_bound: Float[AnyArray, ""]
+    iterations: Int[AnyArray, ""]
+    method: Int[AnyArray, ""]
+    status: Int[AnyArray, ""]
+    rotation: Float[AnyArray, "3 3"]
+    angle: Float[AnyArray, ""]
+    dual: Dual
+    inlier_gap: Int[AnyArray, ""] | None = None
+    explained_gap: Float[AnyArray, ""] | None = None
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, jax.core.Tracer) or np.shape(self.status) != ():
+            return f"Certificate(status={self.status!r})"
+        status, by = CertificateStatus(int(self.status)), CertifiedBy(int(self.method))
+        return (
+            f"Certificate({status.name}, suboptimality <= {float(self.suboptimality):.3g}, "
+            f"by {by.name.lower()}, iterations={int(self.iterations)})"
+        )
