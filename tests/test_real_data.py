@@ -34,6 +34,17 @@ def test_a_source_with_another_pairs_target_is_not_ok(data_dir):
         assert result.status == tj.Status.NO_CONSENSUS or result.status == tj.Status.DEGENERATE
 
 
+@pytest.mark.parametrize("folder", ["kitti_fpfh", "eth_tls"])  # the wall of 3DMatch fits both ways
+@pytest.mark.parametrize("axis", range(3))
+def test_a_mirrored_target_is_not_ok(data_dir, folder, axis):
+    """KITTI 000 and 040 were called ok: a street is flat, and its plane fits a rotation by itself."""
+    mirror = np.where(np.arange(3) == axis, -1, 1)
+    for path in sorted((data_dir / folder).glob("*.npz")):
+        pair = np.load(path)
+        result = tj.register(pair["src"], pair["dst"] * mirror, noise_bound=ACCEPTED[folder][0])
+        assert result.status == tj.Status.NO_CONSENSUS, path.name
+
+
 @pytest.mark.parametrize("number", [1, 3, 5])
 def test_golden_problems_with_unknown_scale(data_dir, number):
     """TEASER++'s test problems (10, 10 and 100 points; 0, 30 and 90 % wrong), free of noise.
