@@ -95,7 +95,7 @@ def report(rows: list[dict]) -> str:
             wanted = said(r["seconds"] < seconds and r["megabytes"] < megabytes)
         text.append(
             f"| {r['method']}, {_scale(r)} | {r['n']} | {1e3 * r['seconds']:.1f} | {r['megabytes']:.0f} "
-            f"| {'yes' if r['right'] else 'no'} | {wanted} |"
+            f"| {said(r['right'])} | {wanted} |"
         )
     return "\n".join(text)
 

@@ -89,7 +89,6 @@ def read_problem(
     cbar2 = _scalar(cbar2, "cbar2")
     scale = None if scale is None else _scale(scale)
     _check_values(src, dst, noise_bound, mask, confidence, dtype)
-    _check_resolution(src, dst, noise_bound, mask, dtype)
 
     def ready(x: Any) -> Any:
         return x.astype(dtype)
@@ -300,15 +299,12 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
             "no row of src and dst is finite: every match holds NaN or infinity. Look where they come from; "
             "give the finite ones."
         )
+    if len(src[usable]):
+        _check_resolution(src, dst, noise_bound, usable, dtype)
 
 
-def _check_resolution(src: Any, dst: Any, noise_bound: Any, mask: Any, dtype: Any) -> None:
+def _check_resolution(src: Any, dst: Any, noise_bound: Any, usable: Any, dtype: Any) -> None:
     """Numbers so large, or held in so few digits, that the bound is lost in their rounding."""
-    if is_traced(src, dst, mask, noise_bound):
-        return
-    usable = finite_rows(src, dst, mask)
-    if not len(src[usable]):
-        return
     largest = max(extent(src[usable]), extent(dst[usable]))
     kind, bound = jnp.finfo(dtype), float(noise_bound[usable].min())
     # Lengths and bounds appear to the fourth power in the test of edges.
@@ -339,10 +335,9 @@ def _check_resolution(src: Any, dst: Any, noise_bound: Any, mask: Any, dtype: An
 
 def _lonely_row(src: Any, dst: Any, usable: Any, largest: float) -> str:
     """Advice, where a single row is what is too large."""
-    reach = np.maximum(np.abs(src).max(axis=1), np.abs(dst).max(axis=1)).astype(np.float64)
-    reach = np.where(np.isin(np.arange(len(src)), np.arange(len(src))[usable]), reach, -1)
-    row = int(np.argmax(reach))
-    usual = float(np.median(reach[reach >= 0]))
+    reach = np.maximum(np.abs(src[usable]).max(axis=1), np.abs(dst[usable]).max(axis=1))
+    row = np.arange(len(src))[usable][np.argmax(reach)]
+    usual = float(np.median(reach.astype(np.float64)))
     if usual * 1e3 >= largest:
         return ""
     return f". Half of the matches stay within {usual:.3g}: if row {row} is corrupt, mask it"

@@ -236,15 +236,15 @@ def prove(
             hopeless = attempt.proved | (claim.allowance <= 0)
             first = attempt
             attempt = lax.cond(hopeless, lambda: first, lambda: iterate(claim, first, iterations))
-    return read_off(m, frame, claim, attempt)
+    return read_off(frame, claim, attempt)
 
 
-def read_off(m: Measurements, frame: Float[Array, "3 3"], claim: Claim, attempt: Attempt) -> Certificate:
+def read_off(frame: Float[Array, "3 3"], claim: Claim, attempt: Attempt) -> Certificate:
     """The certificate of an attempt: a bound always, a verdict where it is proved."""
-    polished, matrix = claim.polished, attempt.matrix
+    m, matrix = claim.polished, attempt.matrix
     measured = jnp.sum(m.mask)
     count = measured.astype(claim.given.dtype) + 1
-    error = rounding(polished, matrix)
+    error = rounding(m, matrix)
     lowest = lax.cond(
         attempt.proved,
         lambda: -claim.shift,
@@ -285,7 +285,7 @@ def read_off(m: Measurements, frame: Float[Array, "3 3"], claim: Claim, attempt:
         status=status,
         rotation=so3.rotate(frame, claim.turn.T).T,
         angle=angle,
-        dual=dual_of(polished, matrix),
+        dual=dual_of(m, matrix),
     )
 
 
@@ -334,14 +334,12 @@ def _first_program(
     m, frame, constant = _measurements(src, dst, rotation, noise_bound, cbar2, mask)
     claim = claim_of(m, constant, tolerance)
     attempt = direct(claim) if reference_rounds is None else as_published(claim, reference_rounds)
-    return read_off(m, frame, claim, attempt), (m, frame, claim, attempt)
+    return read_off(frame, claim, attempt), (frame, claim, attempt)
 
 
 @partial(jax.jit, static_argnames=("iterations",))
-def _second_program(
-    m: Measurements, frame: Array, claim: Claim, attempt: Attempt, *, iterations: int
-) -> Certificate:
-    return read_off(m, frame, claim, iterate(claim, attempt, iterations))
+def _second_program(frame: Array, claim: Claim, attempt: Attempt, *, iterations: int) -> Certificate:
+    return read_off(frame, claim, iterate(claim, attempt, iterations))
 
 
 def padded_size(k: int) -> int:

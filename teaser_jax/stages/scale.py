@@ -46,7 +46,7 @@ def estimate_scale(
 
     A pair whose target length is within its bound agrees with a scale of zero: it cannot tell a scale
     from a collapse and does not vote. Otherwise matches that are many to one, whose lengths are zero
-    exactly, would outvote the right ones from a third of all matches on.
+    exactly, would outvote the right ones as soon as there are as many of them.
 
     Returns:
         Scale [-] in the dtype of the points, 0 where nothing can vote, and the pairs that agree
