@@ -2,6 +2,7 @@
 
 from teaser_jax import files, metrics, plots, so3, synthetic
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.certify.error_bounds import ErrorBounds, error_bounds
 from teaser_jax.certify.pose import certify
 from teaser_jax.certify.rotation import certify_rotation
 from teaser_jax.certify.verify import verify
@@ -10,12 +11,14 @@ from teaser_jax.profile import Profile, profile
 from teaser_jax.register import Registration, register, warmup
 from teaser_jax.solve import refit, select, solve
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
+from teaser_jax.wahba import RotationSolution, solve_rotation
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Certificate", "CertificateStatus", "CertifiedBy", "Pose", "Problem", "Profile", "Registration",
-    "Selection", "Settings", "Solution", "Status",
-    "certify", "certify_rotation", "files", "make_problem", "metrics", "plots", "profile", "refit",
-    "register", "select", "so3", "solve", "stack_problems", "synthetic", "verify", "warmup",
+    "Certificate", "CertificateStatus", "CertifiedBy", "ErrorBounds", "Pose", "Problem", "Profile",
+    "Registration", "RotationSolution", "Selection", "Settings", "Solution", "Status",
+    "certify", "certify_rotation", "error_bounds", "files", "make_problem", "metrics", "plots", "profile",
+    "refit", "register", "select", "so3", "solve", "solve_rotation", "stack_problems", "synthetic", "verify",
+    "warmup",
 ]  # fmt: skip

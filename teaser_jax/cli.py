@@ -92,6 +92,13 @@ def _parser() -> argparse.ArgumentParser:
         "--clique", choices=("exact", "greedy", "networkx", "none"), default=tj.Settings().clique,
         help="how to prune wrong matches (default: exact)",
     )  # fmt: skip
+    register.add_argument(
+        "--rotation", choices=("gnc", "global", "sdp"), default=tj.Settings().rotation,
+        help="how to find the rotation (default: gnc)",
+    )  # fmt: skip
+    register.add_argument(
+        "--certify", action="store_true", help="prove how good the rotation is, and say so in the answer"
+    )
     register.add_argument("--json", action="store_true", help="print the answer as JSON")
     register.add_argument(
         "--plot", type=_picture, metavar="PNG",
@@ -150,7 +157,8 @@ def _register(arguments: argparse.Namespace) -> int:
             "--noise-bound is missing: give the largest error of a right match, in the unit of the points"
         )
     start = time.perf_counter()
-    result = _answer(source, matches, tj.Settings(clique=arguments.clique), known)
+    settings = tj.Settings(clique=arguments.clique, rotation=arguments.rotation)
+    result = _answer(source, matches, settings, known | {"certify": arguments.certify})
     seconds = time.perf_counter() - start
 
     older = output is not None and output.exists()
@@ -171,7 +179,7 @@ def _register(arguments: argparse.Namespace) -> int:
 def _answer(path: Path, matches: Matches, settings: tj.Settings, known: dict[str, Any]) -> tj.Registration:
     try:
         return tj.register(matches.src, matches.dst, settings=settings, **known)
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         raise BadInput(f"{path}: {error}") from error
     except (MemoryError, RuntimeError) as error:
         exhausted = re.search("out of memory|RESOURCE_EXHAUSTED", str(error), re.IGNORECASE)
@@ -260,6 +268,8 @@ def _report(result: tj.Registration, truth: tj.Pose | None, seconds: float) -> d
         "cost": _plain(solution.cost),
         "seconds": round(seconds, 6),
     }
+    if "certificate" in vars(result):
+        report["certificate"] = _certificate(result.certificate)
     if truth is not None:
         error = tj.metrics.errors(pose, truth)
         report["error"] = {
@@ -268,6 +278,24 @@ def _report(result: tj.Registration, truth: tj.Pose | None, seconds: float) -> d
             "scale": _plain(error.scale),
         }
     return report
+
+
+def _certificate(found: tj.Certificate) -> dict[str, Any]:
+    status = tj.CertificateStatus(int(found.status))
+    return {
+        "status": status.name,
+        "advice": status.advice,
+        "is_optimal": bool(found.is_optimal),
+        "is_unique": bool(found.is_unique),
+        "suboptimality": _plain(found.suboptimality),
+        "lower_bound": _plain(found.lower_bound),
+        "angle_bound_deg": _plain(np.degrees(found.angle_bound)),
+        "measurements": int(found.measurements),
+        "iterations": int(found.iterations),
+        "method": tj.CertifiedBy(int(found.method)).name.lower(),
+        "inlier_gap": _plain(found.inlier_gap),
+        "explained_gap": _plain(found.explained_gap),
+    }
 
 
 def _plain(values: Any) -> Any:

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from teaser_jax.packing import choices_of, fetched, pack_problem, unpack_solution
+from teaser_jax.packing import pack_problem
 from teaser_jax.problem import finite_rows, is_traced, pad_problem
 from teaser_jax.register import (
     INSIDE_JIT,
     Registration,
-    after_clique,
     between,
     buckets,
     centre,
     check_settings,
+    concluded,
     device_clique,
     edge_dtype,
     host_problem,
@@ -106,7 +106,8 @@ def profile(
         graph = Graph(scale, scale_pairs, edges)
         found = timed("clique, device", _device_clique, padded, graph, settings)
         clique = timed("clique, host", between, padded, graph, found, found.proved, settings)
-        turned = timed("rotation", _find_rotation, padded, scale, clique.members, settings)
+        turn = find_rotation if settings.rotation == "sdp" else _find_rotation  # a solver on the host
+        turned = timed("rotation", turn, padded, scale, clique.members, settings)
         cascade, _ = timed(
             "translation", _find_translation, padded, scale, clique.members, turned.rotation, settings
         )
@@ -115,7 +116,7 @@ def profile(
             inliers, _ = timed("refinement", _find_inliers, padded, cascade, settings)
         timed("verdict", _judge, padded, cascade, inliers, clique.members, edges)
         sent = pack_problem(centred, settings, *buckets(centred))
-        solution = unpack_solution(fetched(after_clique(sent, graph, clique, choices_of(settings))))
+        solution = concluded(sent, graph, clique, settings)
     medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
     return Profile(cold, medians, registration_of(solution, problem, origins))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from numbers import Integral
 from typing import Any
 
@@ -12,6 +12,9 @@ import numpy as np
 from jaxtyping import Array
 
 from teaser_jax import so3
+from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.certify.pose import certify as certify_pose
+from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.packing import (
     PackedProblem,
     PackedSolution,
@@ -46,12 +49,22 @@ class Registration:
         inliers: (n,) matches that the pose explains.
         status: What happened; ``status.advice`` says what to try.
         solution: The same as a pytree of numpy arrays, with the sets behind the pose.
+        problem: What was asked, as read: ``certify`` and ``refit`` take it with the solution.
     """
 
     pose: Pose
     inliers: np.ndarray
     status: Status
     solution: Solution
+    problem: Problem
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """What is proved of the rotation, given the clique and the inliers; computed when first asked for.
+
+        ``certify(result.problem, result.solution, ...)`` has more choices. It never turns ``ok`` true.
+        """
+        return certify_pose(self.problem, self.solution)
 
     @property
     def ok(self) -> bool:
@@ -76,6 +89,7 @@ def register(
     confidence: Any = None,
     pairs: Any = None,
     settings: Settings = Settings(),
+    certify: bool = False,
 ) -> Registration:
     """Register matched points, most of which may be wrong: ``dst_i ~ s R src_i + t``.
 
@@ -92,6 +106,7 @@ def register(
         confidence: (n,) weights of the matches in the final fit; 0 equals masked.
         pairs: (m, 2) index pairs to compare, or a ``networkx.Graph``; None: all.
         settings: How to solve.
+        certify: Compute ``result.certificate`` at once, for the summary to tell.
 
     Returns:
         A ``Registration``; act upon it only where ``ok``.
@@ -125,16 +140,19 @@ def register(
             f"{len(problem.src)} matches need more memory than there is (n^2 bits for the graph; "
             "n^2 numbers where the scale is voted by consensus): give fewer, the best ones first"
         ) from error
-    return registration_of(solution, problem, origins)
+    result = registration_of(solution, problem, origins)
+    if certify:
+        _ = result.certificate  # computed here, and kept
+    return result
 
 
 def _solved(problem: Problem, settings: Settings, dtype: type) -> Solution:
     """Device, host, device; edges are tested in ``dtype``."""
-    sent, choices = pack_problem(problem, settings, *buckets(problem)), choices_of(settings)
+    sent = pack_problem(problem, settings, *buckets(problem))
     with jax.enable_x64(True):
-        graph, found, proved = before_clique(sent, choices, dtype)
+        graph, found, proved = before_clique(sent, choices_of(settings), dtype)
         clique = between(sent, graph, found, proved, settings)
-        return unpack_solution(fetched(after_clique(sent, graph, clique, choices)))
+        return concluded(sent, graph, clique, settings)
 
 
 def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = Settings()) -> list[int]:
@@ -244,15 +262,6 @@ def edge_dtype(problem: Problem, usable: np.ndarray | slice) -> type:
     return np.float32 if in_range and rounding(np.float32, reach) <= 1e-3 * bound else np.float64
 
 
-# XLA splits each long sum into two kernels on the CPU: half as many again to compile, and no faster.
-WHOLE_SUMS = {"xla_disable_hlo_passes": "tree_reduction_rewriter", "xla_backend_optimization_level": 1}
-# Lengths of a million pairs: an eighth of the time is saved where the CPU has such vectors.
-WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
-# Its older emitters compile in two thirds of the time. What they make of the small kernels behind the
-# clique is as fast; the consistency graph would be three times slower. Newer JAX may not have them.
-OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
-
-
 @partial(jax.jit, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)
 def before_clique(sent: PackedProblem, choices: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
     """Device program one: scale, graph, and the clique as far as the device takes it; is it proved?"""
@@ -286,6 +295,14 @@ def after_clique(sent: PackedProblem, graph: Graph, clique: Clique, choices: Set
     return pack_solution(conclude(problem, graph, clique, settings))
 
 
+def concluded(sent: PackedProblem, graph: Graph, clique: Clique, settings: Settings) -> Solution:
+    """The last part, on the device; with a conic solver on the host, step by step."""
+    if settings.rotation == "sdp":
+        problem, settings = unpack_problem(sent, settings)
+        return jax.device_get(conclude(problem, graph, clique, settings))
+    return unpack_solution(fetched(after_clique(sent, graph, clique, choices_of(settings))))
+
+
 def registration_of(
     solution: Solution, problem: Problem, origins: tuple[np.ndarray, np.ndarray]
 ) -> Registration:
@@ -297,7 +314,7 @@ def registration_of(
     pose = Pose(centred.rotation, translation, np.asarray(centred.scale))
     selection = _first_rows(solution.selection, n, m)
     solution = replace(solution, pose=pose, selection=selection, inliers=selection.inliers)
-    return Registration(pose, selection.inliers, Status(int(solution.status)), solution)
+    return Registration(pose, selection.inliers, Status(int(solution.status)), solution, problem)
 
 
 def _first_rows(selection: Selection, n: int, m: int | None) -> Selection:
@@ -345,6 +362,34 @@ def summary(result: Registration) -> str:
         + ")",
         f"  translation  ({x:.6g}, {y:.6g}, {z:.6g})",
         f"  cost (6)     {float(s.cost):.6g}",
+        *_proofs(result),
         f"  {result.status.advice}",
     ]
     return "\n".join(rows)
+
+
+def _proofs(result: Registration) -> list[str]:
+    """One line for each thing that is proved, and none for what is not."""
+    s, known = result.solution, result.problem.scale is not None
+    votes = "each axis of the translation" if known else "scale and each axis of the translation"
+    most, found = int(s.clique_upper_bound), int(result.inliers.sum())
+    where = "" if known else ", at the voted scale"
+    lines = [
+        f"votes: {votes}, global optimum of its own problem",
+        f"matches: no pose explains more than {most}{where}; this one explains {found}",
+    ]
+    if "certificate" in vars(result):
+        lines.append(f"rotation: {said(result.certificate)}")
+    return [f"  {'proved' if i == 0 else '':<13}{line}" for i, line in enumerate(lines)]
+
+
+def said(certificate: Certificate) -> str:
+    """What a certificate proves, in one line."""
+    c, status = certificate, CertificateStatus(int(certificate.status))
+    measured = int(c.measurements)
+    if not c.is_optimal:
+        better = f", could be improved by {float(c.suboptimality):.2%} at most" if c.lower_bound > 0 else ""
+        return f"not proved optimal ({status.name}{better})"
+    how = CertifiedBy(int(c.method)).name.lower().replace("_", " ")
+    gap = f"optimal within {float(c.suboptimality):.2%} of its cost"
+    return f"{gap}{' and unique' if c.is_unique else ''}, given {measured} measurements ({how})"

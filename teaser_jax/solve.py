@@ -22,6 +22,7 @@ from teaser_jax import so3
 from teaser_jax.stages.clique import Clique, maximum_clique
 from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.invariants import tim_bounds, tims
+from teaser_jax.stages.quadratic_form import Measurements, in_frame_of
 from teaser_jax.stages.refinement import fit_similarity, refine, squared_residuals, truncated_cost
 from teaser_jax.stages.rotation import (
     Rotation,
@@ -32,7 +33,10 @@ from teaser_jax.stages.rotation import (
     estimate_rotation,
     listed_tims,
     ring_tims,
+    settle,
 )  # fmt: skip
+from teaser_jax.stages.rotation_global import search
+from teaser_jax.stages.rotation_sdp import solve_relaxation
 from teaser_jax.stages.scale import ScalePairs, estimate_scale, scale_of_pairs, usable_pairs
 from teaser_jax.stages.translation import estimate_translation, translation_of_points
 from teaser_jax.stages.trust import judge
@@ -179,16 +183,38 @@ def choose(
 def find_rotation(
     problem: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], settings: Settings
 ) -> Rotation:
-    """GNC on the TIMs among the clique's members (12)."""
+    """The rotation of the TIMs among the clique's members (12): GNC, then what ``settings.rotation`` asks."""
     p, _ = usable_rows(problem)
-    return estimate_rotation(
-        _rotation_tims(p, members, _positive(scale), settings.tim_graph),
+    scale = _positive(scale)
+    considered = _rotation_tims(p, members, scale, settings.tim_graph)
+    found = estimate_rotation(
+        considered,
         cbar2=p.cbar2,
         gnc_factor=settings.gnc_factor,
         tolerance=settings.gnc_tolerance,
         iterations=settings.gnc_iterations,
         dtype=p.src.dtype,
     )
+    if settings.rotation == "gnc":
+        return found
+    a, b, bounds, exist = _listed_tims(p, members, scale)
+    m = in_frame_of(
+        found.rotation, a, b, noise_bound=bounds, cbar2=p.cbar2, mask=exist, dtype=p.src.dtype
+    ).measurements
+    turn = search(m)
+    if settings.rotation == "sdp":
+        turn = turn @ _relaxed(m.turned(turn))
+    # The search knows the ring (or the given pairs); which of the two is better is judged on all TIMs.
+    mine, cost = settle(considered, found.rotation, cbar2=p.cbar2)
+    other, its_cost = settle(considered, found.rotation @ turn, cbar2=p.cbar2)
+    return jax.tree.map(lambda x, y: jnp.where(its_cost < cost, y, x), mine, other)
+
+
+def _relaxed(m: Measurements) -> Float[Array, "3 3"]:
+    """The turn to the rotation of the relaxation; raises ValueError under jit."""
+    if not isinstance(m.src, jax.core.Tracer):
+        m = m._replace(src=m.src[m.mask], dst=m.dst[m.mask], mask=m.mask[m.mask])
+    return jnp.asarray(solve_relaxation(m).turn, m.src.dtype)
 
 
 def find_translation(
@@ -267,9 +293,14 @@ def _rotation_tims(p: Problem, members: Array, scale: Array, tim_graph: str) -> 
     """The TIMs of the rotation stage among the clique's members, source scaled."""
     if p.pairs is None and tim_graph == "complete":
         return complete_tims(scale * p.src, p.dst, p.noise_bound, members)
+    return listed_tims(*_listed_tims(p, members, scale))
+
+
+def _listed_tims(p: Problem, members: Array, scale: Array) -> tuple[Array, Array, Array, Array]:
+    """The TIMs of the ring, or of the given pairs, with their bounds and whether they exist."""
     pairs = ring_tims(members) if p.pairs is None else p.pairs
     a, b, bounds = tims(scale * p.src, pairs), tims(p.dst, pairs), tim_bounds(p.noise_bound, pairs)
-    return listed_tims(a, b, bounds, usable_pairs(pairs, members))
+    return a, b, bounds, usable_pairs(pairs, members)
 
 
 def _rotation_of(p: Problem, members: Array, chosen: Array) -> Float[Array, "3 3"]:

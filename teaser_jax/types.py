@@ -85,7 +85,7 @@ class Problem:
 
 
 CliqueMethod = Literal["exact", "greedy", "networkx", "none"]
-RotationMethod = Literal["gnc"]
+RotationMethod = Literal["gnc", "global", "sdp"]
 TimGraph = Literal["chain", "complete"]
 Criterion = Literal["tls", "consensus"]
 
@@ -105,7 +105,8 @@ class Settings:
     Attributes:
         clique: ``"exact"`` maximum clique (host search where the device has no proof),
             ``"greedy"`` on the device, ``"networkx"`` slow oracle, ``"none"`` no pruning.
-        rotation: ``"gnc"``, graduated non-convexity.
+        rotation: ``"gnc"``, graduated non-convexity; ``"global"``, the same and a search over all pairs
+            of TIMs, for hard rotations; ``"sdp"``, the relaxation (23), on the host, up to 100 TIMs.
         tim_graph: TIMs of the rotation stage: ``"chain"`` of consecutive clique members, closed
             to a ring, or the ``"complete"`` graph of the clique. Given pairs take their place.
         vote: Scalar estimates by ``"tls"`` (11) or by maximum ``"consensus"``.

@@ -13,12 +13,12 @@ from numpy.testing import assert_allclose
 import teaser_jax as tj
 from teaser_jax import CertificateStatus, CertifiedBy, certify_rotation
 from teaser_jax.certify.dual import Dual, coupled_guess, dual_matrix, dual_of, reference_guess
+from teaser_jax.certify.host import padded_size
 from teaser_jax.certify.projection import project_dual
-from teaser_jax.certify.quadratic_form import Measurements, cost_matrix
-from teaser_jax.certify.rotation import padded_size
 from teaser_jax.certify.splitting import reference
 from teaser_jax.certify.verify import verify
 from teaser_jax.so3 import rotation_angle
+from teaser_jax.stages.quadratic_form import Measurements, cost_matrix
 from teaser_jax.synthetic import random_rotation
 
 SIGMA, BOUND = 0.01, 0.0554

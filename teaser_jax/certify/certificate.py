@@ -58,13 +58,15 @@ class CertifiedBy(enum.IntEnum):
     DIRECT = 2
     SPLITTING = 3
     REFERENCE = 4
+    RELAXATION = 5
 
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=[
         "cost", "lower_bound", "suboptimality", "absolute_gap", "is_optimal", "is_unique", "angle_bound",
-        "iterations", "method", "status", "rotation", "angle", "dual", "inlier_gap", "explained_gap",
+        "measurements", "iterations", "method", "status", "rotation", "angle", "dual", "inlier_gap",
+        "explained_gap",
     ],
     meta_fields=[],
 )  # fmt: skip
@@ -80,7 +82,8 @@ class Certificate:
         is_optimal: Whether the suboptimality is within the tolerance.
         is_unique: Whether no other rotation reaches the lower bound.
         angle_bound: Every rotation that costs no more lies within this angle; infinite: none follows [rad].
-        iterations: Rounds of the splitting.
+        measurements: How many it is about; those of no length, which no rotation changes, are not counted.
+        iterations: Rounds of the splitting, or of the conic solver.
         method: A ``CertifiedBy`` as int32.
         status: A ``CertificateStatus`` as int32.
         rotation: The given rotation, polished: least squares on its own inliers.
@@ -97,6 +100,7 @@ class Certificate:
     is_optimal: Bool[AnyArray, ""]
     is_unique: Bool[AnyArray, ""]
     angle_bound: Float[AnyArray, ""]
+    measurements: Int[AnyArray, ""]
     iterations: Int[AnyArray, ""]
     method: Int[AnyArray, ""]
     status: Int[AnyArray, ""]

@@ -16,11 +16,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax.certify.dual import dual_matrix, reference_guess
 from teaser_jax.certify.projection import project_dual, project_semidefinite, smallest_eigenvalue
-from teaser_jax.certify.quadratic_form import Measurements
+from teaser_jax.stages.quadratic_form import Measurements
 
 RELAXATION = 1.999999  # any number below 2 converges, and the largest is the fastest in practice
 VECTOR_SCALE = 0.5
-MARGIN, MARGIN_ROUNDS = 0.05, 40
+# How deep inside the cone to aim, in units of the truncation, up to which round. Wide is right for the easy.
+# Of problems with 40 measurements, 90 % wrong, it proves 25 in 30; 0.05 to round 40 and then none: 8.
+MARGINS, UNTIL = (0.03, 0.02, 0.01), (20, 60)
 
 
 class Split(NamedTuple):
@@ -63,7 +65,7 @@ def split(
     exists = existing(m)
     scale = jnp.tile(jnp.array([VECTOR_SCALE] * 3 + [1.0], start.dtype), exists.shape[0])
     first = start * scale[:, None] * scale
-    margin = MARGIN * m.cbar2 * VECTOR_SCALE**2
+    margins = jnp.asarray(MARGINS, start.dtype) * m.cbar2 * VECTOR_SCALE**2
     across = _across(exists)
 
     class State(NamedTuple):
@@ -73,7 +75,7 @@ def split(
         rounds: Array
 
     def once(state: State) -> State:
-        inside = jnp.where(state.rounds < MARGIN_ROUNDS, margin, 0) * across
+        inside = margins[jnp.sum(state.rounds >= jnp.array(UNTIL))] * across
         cone = project_semidefinite(state.iterate - inside) + inside
         affine = first + project_dual(2 * cone - state.iterate - first, exists)
         proved = reaches(m, affine / scale[:, None] / scale, shift)

@@ -183,6 +183,33 @@ def estimate_rotation(
     return Rotation(rotation, kept, final.settled)
 
 
+def settle(
+    tims: Tims, rotation: Float[Array, "3 3"], *, cbar2: Float[Array, ""], iterations: int = 50
+) -> tuple[Rotation, Float[Array, ""]]:
+    """Fit the TIMs within their bounds until the cost (12) stops falling; with that cost."""
+    dtype = rotation.dtype
+    within = lambda r2: (r2 <= cbar2).astype(dtype)
+    # Weights that make w r^2 the truncated residual.
+    truncated = lambda r2: jnp.minimum(1, cbar2 / jnp.maximum(r2, jnp.finfo(dtype).tiny))
+
+    class Step(NamedTuple):
+        rotation: Array
+        cost: Array
+        falling: Array
+        rounds: Array
+
+    def once(state: Step) -> Step:
+        fitted = so3.nearest_rotation(tims.measure(state.rotation, within).correlation)
+        cost = tims.measure(fitted, truncated).cost
+        better = cost < state.cost * (1 - 8 * jnp.finfo(dtype).eps)
+        kept = jnp.where(better, fitted, state.rotation), jnp.where(better, cost, state.cost)
+        return Step(*kept, better, state.rounds + 1)
+
+    start = Step(rotation, tims.measure(rotation, truncated).cost, jnp.ones((), bool), jnp.int32(0))
+    final = lax.while_loop(lambda s: s.falling & (s.rounds < iterations), once, start)
+    return Rotation(final.rotation, tims.members(final.rotation, within), ~final.falling), final.cost
+
+
 def ring_tims(clique: Bool[Array, " n"]) -> Int[Array, "n 2"]:
     """Pairs (i, next member after i) of the clique in the user's order, the last with the first.
 

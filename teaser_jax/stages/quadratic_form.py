@@ -8,12 +8,15 @@ its quaternion (0, 0, 0, 1). Measurements are in units of their noise bounds, so
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
+
+# The positions of the six free numbers of a skew 4x4 block, each with its negative mirrored.
+ROWS, COLUMNS = (0, 0, 1, 0, 1, 2), (1, 2, 2, 3, 3, 3)
 
 
 class Measurements(NamedTuple):
@@ -50,6 +53,48 @@ class Measurements(NamedTuple):
     def turned(self, rotation: Float[Array, "3 3"]) -> Measurements:
         """The same in the frame of another candidate, given from this one's."""
         return self._replace(dst=so3.rotate(rotation.T, self.dst))
+
+
+class Framed(NamedTuple):
+    """Measurements in the frame of a rotation, and what was set apart."""
+
+    measurements: Measurements
+    frame: Float[Array, "3 3"]  # that rotation
+    constant: Float[Array, ""]  # cost of the measurements that no rotation changes [-]
+
+
+def in_frame_of(
+    rotation: Any, src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any, dtype: Any = jnp.float64
+) -> Framed:
+    """Vector pairs in units of their bounds and in the frame of a rotation.
+
+    Rows that are not finite or whose bound is not above zero are left out. A vector of no length has the
+    same residual under every rotation: it is left out, too, and its cost kept.
+
+    Args:
+        rotation: (3, 3), projected on SO(3) first.
+        src, dst: (k, 3).
+        noise_bound: One or (k,).
+        cbar2: Truncation [-].
+        mask: (k,).
+        dtype: Of the result.
+    """
+    src, dst, rotation, noise_bound, cbar2 = (
+        jnp.asarray(x).astype(dtype) for x in (src, dst, rotation, noise_bound, cbar2)
+    )
+    bound = jnp.broadcast_to(noise_bound, src.shape[:1])
+    usable = mask & jnp.all(jnp.isfinite(src), axis=1) & jnp.all(jnp.isfinite(dst), axis=1)
+    usable &= jnp.isfinite(bound) & (bound > 0) & jnp.isfinite(cbar2) & (cbar2 > 0)
+    bound = jnp.where(usable, bound, 1)[:, None]
+    src, dst = (jnp.where(usable[:, None], x, 0) / bound for x in (src, dst))
+    eye = jnp.eye(3, dtype=dtype)
+    frame = so3.nearest_rotation(jnp.where(jnp.all(jnp.isfinite(rotation)), rotation, eye))
+    length2 = jnp.sum(src**2, axis=1), jnp.sum(dst**2, axis=1)
+    turns = usable & (length2[0] > 0) & (length2[1] > 0)
+    rest = usable & ~turns
+    constant = jnp.sum(jnp.where(rest, jnp.minimum(length2[0] + length2[1], cbar2), 0))
+    src, dst = (jnp.where(turns[:, None], x, 0) for x in (src, dst))
+    return Framed(Measurements(src, so3.rotate(frame.T, dst), cbar2, turns), frame, constant)
 
 
 def pair_matrix(src: Float[Array, "k 3"], dst: Float[Array, "k 3"]) -> Float[Array, "k 4 4"]:

@@ -1,0 +1,243 @@
+"""Certificates outside jit: sizes that fit, and the splitting only where the closed form proves nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.certify.dual import Dual
+from teaser_jax.certify.proof import (
+    Attempt,
+    CertifyMethod,
+    Claim,
+    claim_of,
+    direct,
+    iterate,
+    lowest_eigenvalue,
+    lowest_if_unproved,
+    prove,
+    read_off,
+)  # fmt: skip
+from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS
+from teaser_jax.stages.quadratic_form import in_frame_of
+
+QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
+CHUNK_BYTES = 256 << 20  # of the matrices of a stack; some eight of each live at once
+
+
+class Rows(NamedTuple):
+    """Measurements in float64 on the host, those that count first, padded to one of a few sizes."""
+
+    src: np.ndarray
+    dst: np.ndarray
+    noise_bound: np.ndarray
+    cbar2: np.ndarray
+    mask: np.ndarray
+
+
+class State(NamedTuple):
+    """What one program leaves to the next."""
+
+    frame: Array
+    claim: Claim
+    attempt: Attempt
+
+
+def at_once(work: Callable[[], Any]) -> Any:
+    """In float64, and also while somebody's jit is traced around it: all numbers are there."""
+    try:
+        with jax.enable_x64(True):
+            return work()
+    except (jax.errors.TracerArrayConversionError, ValueError) as error:
+        if isinstance(error, ValueError) and "compiler_options" not in str(error):  # at the top level only
+            raise
+        with jax.ensure_compile_time_eval(), jax.enable_x64(True):  # compiles constants one by one: slow
+            return work()
+
+
+def compacted(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: Any) -> Rows:
+    """Checked, and rows of the mask moved to the front. Raises ValueError on bad input."""
+    src, dst, noise_bound, cbar2 = (np.asarray(x, np.float64) for x in (src, dst, noise_bound, cbar2))
+    mask = np.asarray(mask, bool)
+    n = len(src)
+    if mask.shape != (n,) or noise_bound.shape not in ((), (n,)) or cbar2.shape != ():
+        raise ValueError(
+            f"noise_bound, cbar2 and mask have shapes {noise_bound.shape}, {cbar2.shape} and {mask.shape}: "
+            f"expected () or ({n},), () and ({n},)."
+        )
+    bound = np.broadcast_to(noise_bound, (n,))
+    if not (np.all(bound[mask] > 0) and np.isfinite(cbar2) and cbar2 > 0):
+        raise ValueError("noise_bound and cbar2 must be numbers above 0.")
+    k = int(mask.sum())
+    return padded(Rows(src[mask], dst[mask], bound[mask], cbar2, np.ones(k, bool)), padded_size(k))
+
+
+def padded(rows: Rows, size: int) -> Rows:
+    """The same with so many rows."""
+
+    def longer(x: np.ndarray, fill: float) -> np.ndarray:
+        return np.concatenate([x, np.full((size - len(x), *x.shape[1:]), fill, x.dtype)])
+
+    return Rows(
+        longer(rows.src, 0),
+        longer(rows.dst, 0),
+        longer(rows.noise_bound, 1),
+        rows.cbar2,
+        longer(rows.mask, 0),
+    )
+
+
+def padded_size(k: int) -> int:
+    """The size of the programs that serve k measurements: an eighth more at most, sixteen at least."""
+    step = max(8, 1 << max((k - 1).bit_length() - 3, 0))
+    return max(16, -(-k // step) * step)
+
+
+def certify_rows(
+    rows: Rows, rotation: np.ndarray, tolerance: float, *, iterations: int, method: CertifyMethod, most: int
+) -> Certificate:
+    """Program by program: a proof from the closed form ends it, and most of the time does."""
+    if rows.mask.sum() > most:
+        return too_large(rows, rotation)
+
+    def work() -> Certificate:
+        if method == "reference":
+            return jax.device_get(_published(rows, rotation, np.float64(tolerance), iterations=iterations))
+        found, settled, hopeful, state = _first(rows, rotation, np.float64(tolerance))
+        if not settled:
+            go_on = method == "splitting" and hopeful
+            found = _iterated(state, iterations=iterations) if go_on else _bounded(state)
+        return jax.device_get(found)
+
+    found = at_once(work)
+    return _with_blocks(found, int(rows.mask.sum()) + 1)
+
+
+def certify_stack(
+    items: Sequence[Rows],
+    rotations: np.ndarray,
+    tolerance: float,
+    *,
+    iterations: int,
+    method: CertifyMethod,
+    most: int,
+) -> Certificate:
+    """The closed form for all items at once; those that it leaves are taken one by one.
+
+    Not in step with each other: a stack of splittings goes on until the slowest one ends.
+    """
+    found: dict[int, Certificate] = {}
+    alone: dict[str, Any] = dict(iterations=iterations, method=method, most=most)
+    fitting = [i for i, item in enumerate(items) if method != "reference" and item.mask.sum() <= most]
+    size = max([padded_size(int(items[i].mask.sum())) for i in fitting], default=16)
+    step = max(1, CHUNK_BYTES // (8 * (4 * size + 4) ** 2))
+    for start in range(0, len(fitting), step):
+        chunk = fitting[start : start + step]
+        filled = chunk + chunk[:1] * (min(_next_power(len(chunk)), step) - len(chunk))
+        rows = jax.tree.map(lambda *x: np.stack(x), *(padded(cut(items[i]), size) for i in filled))
+        arguments = rows, rotations[filled], np.float64(tolerance)
+        several, settled = at_once(partial(_fetched_stack, *arguments))
+        found |= {i: jax.tree.map(lambda x, j=j: x[j], several) for j, i in enumerate(chunk) if settled[j]}
+    left = [i for i in range(len(items)) if i not in found]
+    if left:
+        with ThreadPoolExecutor(min(len(left), os.cpu_count() or 1)) as pool:
+            several = pool.map(lambda i: certify_rows(items[i], rotations[i], tolerance, **alone), left)
+            found |= dict(zip(left, several, strict=True))
+    n = max((len(c.dual.skew) for c in found.values()), default=1)
+    return jax.tree.map(lambda *x: np.stack(x), *(_with_blocks(found[i], n) for i in range(len(items))))
+
+
+def _next_power(k: int) -> int:
+    return 1 << (k - 1).bit_length()
+
+
+def cut(rows: Rows) -> Rows:
+    """Without padding."""
+    k = int(rows.mask.sum())
+    return rows._replace(
+        src=rows.src[:k], dst=rows.dst[:k], noise_bound=rows.noise_bound[:k], mask=rows.mask[:k]
+    )
+
+
+def _with_blocks(found: Certificate, n: int) -> Certificate:
+    """Its dual with n blocks: padding, which is zero, is cut off or added."""
+    skew, diagonal = (x[:n] for x in found.dual)
+    skew, diagonal, more = skew[:, :n], diagonal[: n - 1], n - len(skew)
+    if more:
+        skew = np.pad(skew, ((0, more), (0, more), (0, 0)))
+        diagonal = np.pad(diagonal, ((0, more), (0, 0), (0, 0)))
+    return replace(found, dual=Dual(skew, diagonal))
+
+
+def too_large(rows: Rows, rotation: np.ndarray) -> Certificate:
+    """Nothing is proved of measurements that are too many to look at."""
+    bound = rows.noise_bound[:, None]
+    r2 = np.sum(((rows.dst - rows.src @ rotation.T) / bound) ** 2, axis=1)
+    cost = np.sum(np.where(rows.mask, np.minimum(r2, rows.cbar2), 0))
+    none, false = np.float64(0), np.bool_(False)
+    return Certificate(
+        cost=cost,
+        lower_bound=none,
+        suboptimality=np.float64(1),
+        absolute_gap=cost / rows.cbar2 / len(r2),
+        is_optimal=false,
+        is_unique=false,
+        angle_bound=np.float64(np.inf),
+        measurements=np.int32(rows.mask.sum()),
+        iterations=np.int32(0),
+        method=np.int32(CertifiedBy.NOTHING),
+        status=np.int32(CertificateStatus.TOO_LARGE),
+        rotation=rotation,
+        angle=none,
+        dual=Dual(np.zeros((1, 1, 6)), np.zeros((0, 4, 4))),
+    )
+
+
+def _closed_form(rows: Rows, rotation: Array, tolerance: Array) -> tuple[Certificate, Array, Array, State]:
+    """The closed form: what it proves, whether that is all there is to say, whether more could be proved."""
+    m, frame, constant = in_frame_of(rotation, **rows._asdict())
+    claim = claim_of(m, constant, tolerance)
+    attempt = direct(claim)
+    found = read_off(frame, claim, attempt, -claim.shift)
+    settled = attempt.proved | (found.method == CertifiedBy.ZERO_COST)
+    settled |= found.status == CertificateStatus.NO_MEASUREMENTS
+    hopeful = claim.possible & (found.status != CertificateStatus.UNDECIDABLE)
+    return found, settled, hopeful, State(frame, claim, attempt)
+
+
+_first = jax.jit(_closed_form, compiler_options=QUICKLY)
+
+
+@partial(jax.jit, compiler_options=QUICKLY)
+def _first_of_stack(rows: Rows, rotations: Array, tolerance: Array) -> tuple[Certificate, Array]:
+    return jax.vmap(lambda rows, rotation: _closed_form(rows, rotation, tolerance)[:2])(rows, rotations)
+
+
+def _fetched_stack(*arguments: Any) -> tuple[Certificate, np.ndarray]:
+    return jax.device_get(_first_of_stack(*arguments))
+
+
+@partial(jax.jit, compiler_options=QUICKLY)
+def _bounded(state: State) -> Certificate:
+    return read_off(*state, lowest_eigenvalue(state.claim, state.attempt))
+
+
+@partial(jax.jit, static_argnames="iterations", compiler_options=QUICKLY)
+def _iterated(state: State, *, iterations: int) -> Certificate:
+    attempt = iterate(state.claim, state.attempt, iterations)
+    return read_off(state.frame, state.claim, attempt, lowest_if_unproved(state.claim, attempt))
+
+
+@partial(jax.jit, static_argnames="iterations", compiler_options=QUICKLY)
+def _published(rows: Rows, rotation: Array, tolerance: Array, *, iterations: int) -> Certificate:
+    m, frame, constant = in_frame_of(rotation, **rows._asdict())
+    return prove(m, frame, constant, tolerance, iterations=iterations, method="reference")

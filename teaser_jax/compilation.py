@@ -1,0 +1,14 @@
+"""How the programs of the host's front doors are compiled: for the CPU's sake, with no global setting."""
+
+from __future__ import annotations
+
+import jax
+
+# XLA splits each long sum into two kernels on the CPU: half as many again to compile, and no faster.
+WHOLE_SUMS = {"xla_disable_hlo_passes": "tree_reduction_rewriter", "xla_backend_optimization_level": 1}
+# Lengths of a million pairs: an eighth of the time is saved where the CPU has such vectors.
+WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
+# Its older emitters compile in two thirds of the time. What they make of the small kernels behind the
+# clique and of certificates is as fast; the consistency graph would be three times slower. Newer JAX may
+# not have them.
+OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
