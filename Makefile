@@ -19,6 +19,9 @@ endif
 test slow notebooks: export JAX_COMPILATION_CACHE_DIR ?= $(abspath $(VENV))/jax-cache
 test slow notebooks: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
 
+# Two workers, each with threads of its own for small matrices, wait for one another.
+test slow: export OPENBLAS_NUM_THREADS ?= 1
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test slow lint notebooks bench oldest newest wheel size clean
 

@@ -113,6 +113,8 @@ def solve_rotation(
     """
     if method not in ("gnc", "global", "sdp"):
         raise ValueError(f"method is {method!r}: expected 'gnc', 'global' or 'sdp'.")
+    if proof not in (None, "splitting", "direct", "reference"):
+        raise ValueError(f"proof is {proof!r}: expected 'splitting', 'direct', 'reference' or None.")
     if np.shape(src) != np.shape(dst) or np.ndim(src) != 2 or np.shape(src)[1] != 3:
         raise ValueError(
             f"src and dst have shapes {np.shape(src)} and {np.shape(dst)}: expected (k, 3) both, rows are "

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from itertools import combinations
 from typing import NamedTuple
 
 import jax
@@ -186,3 +188,56 @@ def length_gaps(src, dst, scale: float = 1.0) -> np.ndarray:
         return np.sqrt(np.sum((x[:, None] - x[None]) ** 2, axis=2))
 
     return np.abs(lengths(dst) - np.longdouble(scale) * lengths(src))
+
+
+BOUND = 0.0554  # of vectors with noise of deviation 0.01 that is cut off there
+
+
+def draw_vectors(
+    seed, k: int, wrong: float, sigma: float = 0.01
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vectors of a unit cube, wrong ones of the right length, and the rotation behind the others."""
+    rng = np.random.default_rng(seed)
+    src, rotation = rng.uniform(-0.5, 0.5, (k, 3)), random_rotation(rng)
+    dst = src @ rotation.T + np.clip(sigma * rng.normal(size=(k, 3)), -3 * sigma, 3 * sigma)
+    bad = rng.permutation(k)[: round(wrong * k)]
+    odd = rng.normal(size=(len(bad), 3))
+    dst[bad] = odd * (np.linalg.norm(src[bad], axis=1) / np.linalg.norm(odd, axis=1))[:, None]
+    return src, dst, rotation
+
+
+def turned(rotation: np.ndarray, degrees: float, seed=0) -> np.ndarray:
+    """The rotation, turned about a random axis."""
+    axis = np.random.default_rng(seed).normal(size=3)
+    return rotation @ Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+
+
+def rotation_cost(src, dst, rotation, bound=BOUND) -> float:
+    """The truncated cost (12) in units of the bound."""
+    return float(np.minimum(np.sum(((dst - src @ rotation.T) / bound) ** 2, axis=1), 1).sum())
+
+
+def best_rotation(src, dst, bound=BOUND) -> tuple[np.ndarray, float]:
+    """The optimum of (12), by fits to all of up to three vectors, each fitted to its own inliers again."""
+
+    def aligned(members) -> np.ndarray:
+        with warnings.catch_warnings():  # one vector, or two in line, leave a turn free: any will do
+            warnings.simplefilter("ignore", UserWarning)
+            return Rotation.align_vectors(dst[members], src[members])[0].as_matrix()
+
+    best, least = np.eye(3), rotation_cost(src, dst, np.eye(3), bound)
+    turning = np.flatnonzero(np.any(src != 0, axis=1) & np.any(dst != 0, axis=1))
+    for members in [m for size in (1, 2, 3) for m in combinations(turning, size)]:
+        rotation = aligned(list(members))
+        for _ in range(20):
+            now = rotation_cost(src, dst, rotation, bound)
+            if now < least:
+                best, least = rotation, now
+            within = np.sum((dst - src @ rotation.T) ** 2, axis=1) <= bound**2
+            if not within[turning].any():
+                break
+            fitted = aligned(within)
+            if np.abs(fitted - rotation).max() < 1e-13:
+                break
+            rotation = fitted
+    return best, least

@@ -95,7 +95,9 @@ def test_options_win_over_the_file_and_the_file_over_the_defaults(
     tmp_path, small, solved, capsys, monkeypatch, name
 ):
     received = []
-    monkeypatch.setattr(tj, "register", lambda *_, settings, **known: received.append(known) or solved)
+    monkeypatch.setattr(
+        tj, "register", lambda *_, settings, certify, **known: received.append(known) or solved
+    )
     plain, full = tmp_path / "plain.npz", tmp_path / "full.npz"
     np.savez(plain, src=small.src, dst=small.dst)
     np.savez(full, src=small.src, dst=small.dst, **{name: 2.0})
