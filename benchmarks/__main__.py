@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks import accuracy, baseline, clique, cold, growth, speed, stream, trust
+from benchmarks import accuracy, baseline, certificate, clique, cold, growth, speed, stream, trust
 
 HERE = Path(__file__).parent
 BENCHMARKS = {
@@ -18,6 +18,7 @@ BENCHMARKS = {
     "stream": stream,
     "cold": cold,
     "growth": growth,
+    "certificate": certificate,
 }
 
 

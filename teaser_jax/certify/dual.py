@@ -89,9 +89,9 @@ def coupled_guess(m: Measurements, *, correct_outliers: bool | Bool[Array, ""]) 
             the price of curvature in block (0, 0): good for few outliers, bad for many.
     """
     plus, minus = cost_blocks(m)
-    eye = jnp.eye(3, dtype=m.src.dtype)
-    r2 = jnp.where(m.inliers, jnp.sum(m.residuals**2, axis=1), 0)
-    top = 0.5 * plus[:, :3, :3] - 0.5 * r2[:, None, None] * eye
+    # The published guess takes r^2 / 2 from the blocks of inliers, which makes those with a residual of more
+    # than 0.7 c indefinite along their vector, and nothing asks for it.
+    top = 0.5 * plus[:, :3, :3]
     top = top + jnp.where(correct_outliers, _outlier_correction(m), 0)
     y = _coupling(m)
     last = -jnp.sum(y, axis=1)

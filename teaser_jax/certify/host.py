@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,7 +29,6 @@ from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS
 from teaser_jax.stages.quadratic_form import in_frame_of
 
 QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
-CHUNK_BYTES = 256 << 20  # of the matrices of a stack; some eight of each live at once
 
 
 class Rows(NamedTuple):
@@ -114,50 +111,18 @@ def certify_rows(
             return jax.device_get(_published(rows, rotation, np.float64(tolerance), iterations=iterations))
         found, settled, hopeful, state = _first(rows, rotation, np.float64(tolerance))
         if not settled:
-            go_on = method == "splitting" and hopeful
-            found = _iterated(state, iterations=iterations) if go_on else _bounded(state)
+            found = go_on(state, hopeful=hopeful, iterations=iterations, method=method)
         return jax.device_get(found)
 
     found = at_once(work)
-    return _with_blocks(found, int(rows.mask.sum()) + 1)
+    return with_blocks(found, int(rows.mask.sum()) + 1)
 
 
-def certify_stack(
-    items: Sequence[Rows],
-    rotations: np.ndarray,
-    tolerance: float,
-    *,
-    iterations: int,
-    method: CertifyMethod,
-    most: int,
-) -> Certificate:
-    """The closed form for all items at once; those that it leaves are taken one by one.
-
-    Not in step with each other: a stack of splittings goes on until the slowest one ends.
-    """
-    found: dict[int, Certificate] = {}
-    alone: dict[str, Any] = dict(iterations=iterations, method=method, most=most)
-    fitting = [i for i, item in enumerate(items) if method != "reference" and item.mask.sum() <= most]
-    size = max([padded_size(int(items[i].mask.sum())) for i in fitting], default=16)
-    step = max(1, CHUNK_BYTES // (8 * (4 * size + 4) ** 2))
-    for start in range(0, len(fitting), step):
-        chunk = fitting[start : start + step]
-        filled = chunk + chunk[:1] * (min(_next_power(len(chunk)), step) - len(chunk))
-        rows = jax.tree.map(lambda *x: np.stack(x), *(padded(cut(items[i]), size) for i in filled))
-        arguments = rows, rotations[filled], np.float64(tolerance)
-        several, settled = at_once(partial(_fetched_stack, *arguments))
-        found |= {i: jax.tree.map(lambda x, j=j: x[j], several) for j, i in enumerate(chunk) if settled[j]}
-    left = [i for i in range(len(items)) if i not in found]
-    if left:
-        with ThreadPoolExecutor(min(len(left), os.cpu_count() or 1)) as pool:
-            several = pool.map(lambda i: certify_rows(items[i], rotations[i], tolerance, **alone), left)
-            found |= dict(zip(left, several, strict=True))
-    n = max((len(c.dual.skew) for c in found.values()), default=1)
-    return jax.tree.map(lambda *x: np.stack(x), *(_with_blocks(found[i], n) for i in range(len(items))))
-
-
-def _next_power(k: int) -> int:
-    return 1 << (k - 1).bit_length()
+def go_on(state: State, *, hopeful: Any, iterations: int, method: CertifyMethod) -> Certificate:
+    """The certificate of what the closed form did not prove: a bound, and a proof where one can be had."""
+    if method == "splitting" and hopeful:
+        return _iterated(state, iterations=iterations)
+    return _bounded(state)
 
 
 def cut(rows: Rows) -> Rows:
@@ -168,7 +133,7 @@ def cut(rows: Rows) -> Rows:
     )
 
 
-def _with_blocks(found: Certificate, n: int) -> Certificate:
+def with_blocks(found: Certificate, n: int) -> Certificate:
     """Its dual with n blocks: padding, which is zero, is cut off or added."""
     skew, diagonal = (x[:n] for x in found.dual)
     skew, diagonal, more = skew[:, :n], diagonal[: n - 1], n - len(skew)
@@ -202,7 +167,7 @@ def too_large(rows: Rows, rotation: np.ndarray) -> Certificate:
     )
 
 
-def _closed_form(rows: Rows, rotation: Array, tolerance: Array) -> tuple[Certificate, Array, Array, State]:
+def closed_form(rows: Rows, rotation: Array, tolerance: Array) -> tuple[Certificate, Array, Array, State]:
     """The closed form: what it proves, whether that is all there is to say, whether more could be proved."""
     m, frame, constant = in_frame_of(rotation, **rows._asdict())
     claim = claim_of(m, constant, tolerance)
@@ -214,16 +179,7 @@ def _closed_form(rows: Rows, rotation: Array, tolerance: Array) -> tuple[Certifi
     return found, settled, hopeful, State(frame, claim, attempt)
 
 
-_first = jax.jit(_closed_form, compiler_options=QUICKLY)
-
-
-@partial(jax.jit, compiler_options=QUICKLY)
-def _first_of_stack(rows: Rows, rotations: Array, tolerance: Array) -> tuple[Certificate, Array]:
-    return jax.vmap(lambda rows, rotation: _closed_form(rows, rotation, tolerance)[:2])(rows, rotations)
-
-
-def _fetched_stack(*arguments: Any) -> tuple[Certificate, np.ndarray]:
-    return jax.device_get(_first_of_stack(*arguments))
+_first = jax.jit(closed_form, compiler_options=QUICKLY)
 
 
 @partial(jax.jit, compiler_options=QUICKLY)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertificateStatus
-from teaser_jax.certify.host import certify_rows, certify_stack, compacted
+from teaser_jax.certify.host import certify_rows, compacted
 from teaser_jax.certify.proof import CertifyMethod
 from teaser_jax.certify.rotation import (
     MAX_MEASUREMENTS,
@@ -23,6 +23,7 @@ from teaser_jax.certify.rotation import (
     check_tolerance,
     default_iterations,
 )  # fmt: skip
+from teaser_jax.certify.stack import certify_stack
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.solve import cascade_pose, usable_rows
