@@ -385,6 +385,7 @@ def report(rows: list[dict]) -> str:
         left = ", ".join(f"{seed}: {gap:.2%}" for seed, gap in r["left"]) or "-"
         text.append(
             f"| {r['rate']:.0%} | {r['runs']} | {r['proved']} | {r['iterations']:.1f} "
-            f"| {r['milliseconds']:.0f} | {r['gnc_right']} | {r['gnc_right_proved']} | {r['gnc_wrong_proved']} | {left} |"
+            f"| {r['milliseconds']:.0f} | {r['gnc_right']} | {r['gnc_right_proved']} "
+            f"| {r['gnc_wrong_proved']} | {left} |"
         )
     return "\n".join(text)

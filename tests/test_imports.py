@@ -26,7 +26,7 @@ ORDER = [
     "certify.relaxation",
     "certify.pose", "certify.error_bounds", "certify.verify", "wahba",
     "packing", "register", "profile",
-    "metrics", "synthetic", "files", "plots", "cli",
+    "metrics", "synthetic", "files", "plots.stages", "plots.proofs", "cli",
 ]  # fmt: skip
 # The search returns to the module that calls it for one thing: networkx, where numba cannot be had.
 KNOWN = {("stages.clique", "stages.clique_search")}

@@ -103,3 +103,24 @@ def test_without_matplotlib_the_extra_is_named(monkeypatch, small, solved):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"teaser-jax\[viz\]"):
         plots.plot_registration(small.src, small.dst, solved)
+
+
+def test_the_cost_and_its_bound(solved):
+    keep = solved.inliers | solved.solution.selection.clique
+    p = solved.problem
+    src, dst = (x[keep] - x[solved.inliers].mean(axis=0) for x in (p.src, p.dst))
+    figure = plots.plot_landscape(src, dst, solved.certificate, noise_bound=p.noise_bound[keep])
+    whole, close = figure.axes
+    assert whole.get_title() == "Every rotation: OPTIMAL"
+    lowest = min(line.get_ydata().min() for line in whole.lines)
+    assert lowest >= float(solved.certificate.lower_bound) - 1e-9
+    drawn(figure)
+
+
+def test_certified_answers_and_error_bounds():
+    figure = plots.plot_certified({"right": (3, 4), "wrong": (0, 0)})
+    assert [t.get_text() for t in figure.axes[0].texts] == ["3 of 4", "0 of 0"]
+    drawn(figure)
+    true, bounds = np.array([0.1, 0.2, 0.0]), np.array([1.0, 3.0, np.inf])
+    drawn(plots.plot_bounds({"whole set": (true, bounds), "paper": (true, 10 * bounds)}))
+    drawn(plots.plot_bounds({}))

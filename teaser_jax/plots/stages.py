@@ -1,10 +1,4 @@
-"""Pictures of an answer and of each stage behind it.
-
-Every function returns a ``matplotlib.figure.Figure`` of its own: nothing is shown, no global
-matplotlib state is read for layout or changed, and any backend will do. Save one with
-``figure.savefig(path)``; in a notebook it shows after ``%matplotlib inline``. Matplotlib is the
-extra ``viz`` and loads when a function is called.
-"""
+"""Pictures of an answer and of each stage behind it."""
 
 from __future__ import annotations
 
@@ -52,7 +46,7 @@ def plot_registration(
     here, there = (src - middle) @ eye.T, _centred(dst) @ eye.T
     back = (result.pose.inverse().apply(dst) - middle) @ eye.T
 
-    figure = _figure((11, 4.8))
+    figure = new_figure((11, 4.8))
     before, after = figure.subplots(1, 2)
     there = there + [1.1 * (_reach(here)[0] + _reach(there)[0]), 0, 0]
     both = np.concatenate([here, there])
@@ -72,7 +66,7 @@ def plot_registration(
     _cloud(after, here, SRC)
     _segments(after, here[inliers], back[inliers], GOOD, 1.0, 1.0)
     _cloud(after, back[inliers], GOOD, size=13)
-    _legend(figure, {"source": SRC, "target": DST, "inliers": GOOD, "rejected matches": PALE})
+    legend(figure, {"source": SRC, "target": DST, "inliers": GOOD, "rejected matches": PALE})
     return figure
 
 
@@ -98,17 +92,17 @@ def plot_trims(
     voters = np.isfinite(values) & np.isfinite(reach)
     values, reach = values[voters], reach[voters]
     low, high = 0.0, max(2.0 * float(estimate), np.quantile(values, 0.9) if values.size else 1.0)
-    figure = _figure((9, 3.6))
+    figure = new_figure((9, 3.6))
     left, right = figure.subplots(1, 2)
     left.hist(values, bins=120, range=(low, high), color=DST)
-    _label(left, "measurements of the scale", "s_ij", "pairs of matches")
+    label(left, "measurements of the scale", "s_ij", "pairs of matches")
     grid = np.linspace(low, high, 1200)
     agreeing = np.searchsorted(np.sort(values - reach), grid, side="right") - np.searchsorted(
         np.sort(values + reach), grid, side="left"
     )
     right.fill_between(grid, agreeing, color=DST, alpha=0.25, linewidth=0)
     right.plot(grid, agreeing, color=DST, linewidth=1.2)
-    _label(right, "how many measurements allow a scale", "s", "pairs that agree")
+    label(right, "how many measurements allow a scale", "s", "pairs that agree")
     for axes in (left, right):
         axes.axvline(float(estimate), color=GOOD, linewidth=1.6, label=f"estimate {float(estimate):.4g}")
         if truth is not None:
@@ -129,7 +123,7 @@ def plot_graph(edge_bits: UInt32[np.ndarray, "n w"], clique: Bool[np.ndarray, " 
     degree = edges.sum(axis=1)
     order = np.lexsort((-degree, ~clique))
     n, size = len(degree), int(clique.sum())
-    figure = _figure((9, 4.2))
+    figure = new_figure((9, 4.2))
     left, right = figure.subplots(1, 2)
     i, j = np.nonzero(edges[np.ix_(order, order)])
     inside = (i < size) & (j < size)
@@ -138,12 +132,12 @@ def plot_graph(edge_bits: UInt32[np.ndarray, "n w"], clique: Bool[np.ndarray, " 
         left.scatter(j[rows], i[rows], s=dot, marker="s", color=color, linewidths=0, rasterized=True)
     left.set(xlim=(-0.5, n - 0.5), ylim=(n - 0.5, -0.5), aspect="equal")
     density = edges.sum() / max(n * (n - 1), 1)
-    _label(left, f"which matches agree: {density:.1%} of the pairs", "match (clique first)", "match")
+    label(left, f"which matches agree: {density:.1%} of the pairs", "match (clique first)", "match")
     rank = np.arange(n)
     right.bar(rank, degree[order], width=1.0, color=np.where(clique[order], GOOD, PALE))
     right.axhline(size - 1, color=GOOD, linewidth=1, linestyle=":")
     title = f"degree of each match; the clique has {size}"
-    _label(right, title, "match (clique first)", "matches it agrees with")
+    label(right, title, "match (clique first)", "matches it agrees with")
     right.set_xlim(-0.5, n - 0.5)
     return figure
 
@@ -172,7 +166,7 @@ def plot_clique(
     i, j = np.nonzero(np.triu(edges, 1))
     inside = clique[i] & clique[j]
     outside = np.random.default_rng(0).permutation(np.flatnonzero(~inside))[:lines]
-    figure = _figure((5.6, 5.6))
+    figure = new_figure((5.6, 5.6))
     axes = figure.subplots()
     _segments(axes, place[i[outside]], place[j[outside]], PALE, 0.3, 0.5)
     _segments(axes, place[i[inside]], place[j[inside]], GOOD, 0.5, min(1.0, 0.08 + 8 / max(size, 1)))
@@ -201,7 +195,7 @@ def plot_residuals(
         of: What was measured, for the title.
     """
     size, kept = np.sqrt(np.asarray(squared, float)), np.asarray(kept, bool)
-    figure = _figure((6.4, 3.4))
+    figure = new_figure((6.4, 3.4))
     axes = figure.subplots()
     limit = max(2.0 * np.sqrt(cbar2), float(np.quantile(size, 0.98)) if size.size else 0.0)
     sets = [np.minimum(size[kept], limit), np.minimum(size[~kept], limit)]
@@ -209,7 +203,7 @@ def plot_residuals(
     axes.set_xlim(0, limit)
     axes.hist(sets, bins=60, range=(0, limit), stacked=True, color=[GOOD, PALE], label=labels)
     _truncation(axes, cbar2)
-    _label(axes, f"residuals of the {of}", "residual / bound (the last bar holds all beyond)", "number")
+    label(axes, f"residuals of the {of}", "residual / bound (the last bar holds all beyond)", "number")
     axes.legend(frameon=False, fontsize=8)
     return figure
 
@@ -234,7 +228,7 @@ def plot_translation(
     offsets, members = np.asarray(offsets, float), np.asarray(members, bool)
     estimate = np.asarray(estimate, float)
     reach = np.sqrt(cbar2) * np.broadcast_to(noise_bound, len(offsets))
-    figure = _figure((10, 3.6))
+    figure = new_figure((10, 3.6))
     for k, axes in enumerate(figure.subplots(1, 3)):
         order = np.argsort(offsets[:, k])
         x, r, kept = offsets[order, k] - estimate[k], reach[order], members[order, k]
@@ -246,7 +240,7 @@ def plot_translation(
         half = 4 * float(np.median(reach)) if len(reach) else 1.0
         axes.set_xlim(-half, half)
         title = f"{'xyz'[k]}: {estimate[k]:.4g}, {kept.sum()} of {len(x)} agree"
-        _label(axes, title, "offset from the estimate", "point, sorted" if k == 0 else "")
+        label(axes, title, "offset from the estimate", "point, sorted" if k == 0 else "")
     return figure
 
 
@@ -259,7 +253,7 @@ def plot_refinement(
         before, after: |b - s R a - t|^2 / beta^2 of each match [-].
         cbar2: Truncation [-].
     """
-    figure = _figure((9, 3.6))
+    figure = new_figure((9, 3.6))
     left, right = figure.subplots(1, 2)
     sizes = [np.sqrt(np.sort(np.asarray(r2, float))) for r2 in (before, after)]
     limit = 2.5 * np.sqrt(cbar2)
@@ -273,15 +267,16 @@ def plot_refinement(
     shown = max((int((size <= limit).sum()) for size in sizes), default=1)
     left.set(xlim=(0, limit), ylim=(0, 1.05 * max(shown, 1)))
     right.set_xlim(0, limit)
-    _label(left, "matches explained within a residual", "residual / bound", "matches")
-    _label(right, "residuals of the explained matches", "residual / bound", "matches")
+    label(left, "matches explained within a residual", "residual / bound", "matches")
+    label(right, "residuals of the explained matches", "residual / bound", "matches")
     for axes, corner in ((left, "lower right"), (right, "upper right")):
         _truncation(axes, cbar2)
         axes.legend(frameon=False, fontsize=8, loc=corner)
     return figure
 
 
-def _figure(size: tuple[float, float]) -> Figure:
+def new_figure(size: tuple[float, float]) -> Figure:
+    """An empty one, bound to no backend."""
     try:
         from matplotlib.figure import Figure
         from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -366,7 +361,8 @@ def _edges(edge_bits: np.ndarray, clique: np.ndarray) -> tuple[np.ndarray, np.nd
     return unpack_host(np.asarray(edge_bits), len(clique)), clique
 
 
-def _label(axes: Axes, title: str, x: str, y: str) -> None:
+def label(axes: Axes, title: str, x: str, y: str) -> None:
+    """Title and axes in the style of all pictures."""
     from matplotlib.ticker import MaxNLocator
 
     axes.set_title(title, fontsize=10, color=INK)
@@ -382,7 +378,8 @@ def _truncation(axes: Axes, cbar2: float) -> None:
     axes.axvline(np.sqrt(cbar2), color=BAD, linewidth=1, linestyle="--", label="truncation")
 
 
-def _legend(figure: Figure, colors: dict[str, str]) -> None:
+def legend(figure: Figure, colors: dict[str, str]) -> None:
+    """Below the panels: what each colour is."""
     from matplotlib.lines import Line2D
 
     handles = [

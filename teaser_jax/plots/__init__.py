@@ -1,0 +1,23 @@
+"""Pictures of an answer, of each stage behind it, and of what is proved.
+
+Every function returns a ``matplotlib.figure.Figure`` of its own: nothing is shown, no global
+matplotlib state is read for layout or changed, and any backend will do. Save one with
+``figure.savefig(path)``; in a notebook it shows after ``%matplotlib inline``. Matplotlib is the
+extra ``viz`` and loads when a function is called.
+"""
+
+from teaser_jax.plots.proofs import plot_bounds, plot_certified, plot_landscape
+from teaser_jax.plots.stages import (
+    plot_clique,
+    plot_graph,
+    plot_refinement,
+    plot_registration,
+    plot_residuals,
+    plot_translation,
+    plot_trims,
+)
+
+__all__ = [
+    "plot_bounds", "plot_certified", "plot_clique", "plot_graph", "plot_landscape", "plot_refinement",
+    "plot_registration", "plot_residuals", "plot_translation", "plot_trims",
+]  # fmt: skip
