@@ -314,7 +314,9 @@ def registration_of(
     pose = Pose(centred.rotation, translation, np.asarray(centred.scale))
     selection = _first_rows(solution.selection, n, m)
     solution = replace(solution, pose=pose, selection=selection, inliers=selection.inliers)
-    return Registration(pose, selection.inliers, Status(int(solution.status)), solution, problem)
+    # A certificate may be asked for later, when the caller's arrays hold something else.
+    kept = jax.tree.map(np.array, problem)
+    return Registration(pose, selection.inliers, Status(int(solution.status)), solution, kept)
 
 
 def _first_rows(selection: Selection, n: int, m: int | None) -> Selection:

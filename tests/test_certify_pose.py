@@ -115,3 +115,11 @@ def test_clouds_far_from_the_origin():
     away = tj.register(drawn.src + far, drawn.dst - far, noise_bound=drawn.noise_bound)
     assert_allclose(away.certificate.lower_bound, near.certificate.lower_bound, rtol=1e-5)
     assert away.certificate.is_optimal
+
+
+def test_a_result_keeps_what_it_was_asked(small):
+    src, dst = small.src.copy(), small.dst.copy()
+    result = tj.register(src, dst, noise_bound=small.noise_bound)
+    src[:], dst[:] = 0, 1  # the caller's buffers are used again
+    assert result.certificate.is_optimal
+    assert result.certificate.measurements == 16

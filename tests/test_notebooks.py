@@ -15,7 +15,9 @@ from nbclient import NotebookClient
 import teaser_jax
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
-NOTEBOOKS = [FOLDER / "01_quickstart.ipynb", FOLDER / "02_inside_the_method.ipynb"]
+NOTEBOOKS = [
+    FOLDER / f"{name}.ipynb" for name in ("01_quickstart", "02_inside_the_method", "03_certificates")
+]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
