@@ -8,6 +8,12 @@ extra ``viz`` and loads when a function is called.
 
 from teaser_jax.plots.proofs import plot_bounds, plot_certified, plot_landscape
 from teaser_jax.plots.stages import (
+    BAD,
+    DST,
+    GOOD,
+    INK,
+    PALE,
+    SRC,
     plot_clique,
     plot_graph,
     plot_refinement,
@@ -18,6 +24,7 @@ from teaser_jax.plots.stages import (
 )
 
 __all__ = [
+    "BAD", "DST", "GOOD", "INK", "PALE", "SRC",
     "plot_bounds", "plot_certified", "plot_clique", "plot_graph", "plot_landscape", "plot_refinement",
     "plot_registration", "plot_residuals", "plot_translation", "plot_trims",
 ]  # fmt: skip
