@@ -13,6 +13,8 @@ from jaxtyping import Array
 
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.certify.host import compile_ahead
+from teaser_jax.certify.pose import MAX_TRACED
 from teaser_jax.certify.pose import certify as certify_pose
 from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.packing import (
@@ -155,7 +157,13 @@ def _solved(problem: Problem, settings: Settings, dtype: type) -> Solution:
         return concluded(sent, graph, clique, settings)
 
 
-def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = Settings()) -> list[int]:
+def warmup(
+    max_points: int,
+    *,
+    scale: float | None = 1.0,
+    settings: Settings = Settings(),
+    certify: bool = False,
+) -> list[int]:
     """Compile ahead whatever ``register`` needs for up to so many matches; two to four seconds a size.
 
     With ``jax.config.update("jax_compilation_cache_dir", ...)`` the next process finds the programs
@@ -165,6 +173,7 @@ def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = S
         max_points: The largest number of matches to come.
         scale: None if the scale will be estimated; otherwise any number.
         settings: Those of the calls to come.
+        certify: Whether certificates of up to 128 measurements will be asked for: some 25 seconds more.
 
     Returns:
         The sizes that now stand ready: matches are padded to the next one.
@@ -184,6 +193,8 @@ def warmup(max_points: int, *, scale: float | None = 1.0, settings: Settings = S
         register(points, points, noise_bound=0.1, scale=scale, mask=mask, settings=settings)
     if settings.clique == "exact":
         load_kernels()
+    if certify:
+        compile_ahead(min(max_points, MAX_TRACED))
     return sizes
 
 

@@ -28,6 +28,7 @@ from teaser_jax.certify.rotation import (
     MAX_MEASUREMENTS,
     TOLERANCE,
     certify_rotation,
+    check_count,
     check_tolerance,
     default_iterations,
 )  # fmt: skip
@@ -122,7 +123,7 @@ def solve_rotation(
         )
     k = np.shape(src)[0]
     mask = np.ones(k, bool) if mask is None else mask
-    rounds = default_iterations(k) if iterations is None else iterations
+    rounds = default_iterations(k) if iterations is None else check_count("iterations", iterations)
     if is_traced(src, dst, noise_bound, cbar2, mask, tolerance):
         if method == "sdp":
             raise ValueError("method='sdp' calls a conic solver and runs outside jit only: take 'global'.")

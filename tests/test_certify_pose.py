@@ -123,3 +123,24 @@ def test_a_result_keeps_what_it_was_asked(small):
     src[:], dst[:] = 0, 1  # the caller's buffers are used again
     assert result.certificate.is_optimal
     assert result.certificate.measurements == 16
+
+
+def test_after_warmup_certificates_compile_nothing():
+    tj.warmup(16, certify=True)
+    compiled, listening = [], [True]
+
+    def listener(event, *_, **__):
+        if listening and "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listener)
+    drawn = tj.synthetic.random_problem(0, n=16, outlier_rate=0.5)
+    result = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, certify=True)
+    assert result.certificate.method == tj.CertifiedBy.DIRECT
+    for rotation in (np.eye(3), -result.pose.rotation):  # neither is a proof by the closed form
+        other = replace(result.solution, pose=replace(result.pose, rotation=rotation))
+        assert not tj.certify(result.problem, other, iterations=7).is_optimal
+    assert not compiled
+    tj.certify(result.problem, result.solution, method="reference")
+    assert compiled  # whatever is new is seen
+    listening.clear()

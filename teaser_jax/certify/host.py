@@ -118,10 +118,22 @@ def certify_rows(
     return with_blocks(found, int(rows.mask.sum()) + 1)
 
 
+def compile_ahead(most: int) -> None:
+    """All programs that certify up to so many measurements."""
+
+    def everything(rows: Rows) -> tuple[Certificate, Certificate]:
+        state = _first(rows, np.eye(3), np.float64(1e-3))[-1]
+        return _iterated(state, np.int32(0)), _bounded(state)
+
+    three = Rows(np.eye(3), np.eye(3), np.ones(3), np.asarray(1.0), np.ones(3, bool))
+    for size in sorted({padded_size(k) for k in range(1, most + 1)}):
+        jax.block_until_ready(at_once(partial(everything, padded(three, size))))
+
+
 def go_on(state: State, *, hopeful: Any, iterations: int, method: CertifyMethod) -> Certificate:
     """The certificate of what the closed form did not prove: a bound, and a proof where one can be had."""
     if method == "splitting" and hopeful:
-        return _iterated(state, iterations=iterations)
+        return _iterated(state, np.int32(iterations))
     return _bounded(state)
 
 
@@ -147,7 +159,7 @@ def too_large(rows: Rows, rotation: np.ndarray) -> Certificate:
     """Nothing is proved of measurements that are too many to look at."""
     bound = rows.noise_bound[:, None]
     r2 = np.sum(((rows.dst - rows.src @ rotation.T) / bound) ** 2, axis=1)
-    cost = np.sum(np.where(rows.mask, np.minimum(r2, rows.cbar2), 0))
+    cost = np.sum(np.where(rows.mask & np.isfinite(r2), np.minimum(r2, rows.cbar2), 0))
     none, false = np.float64(0), np.bool_(False)
     return Certificate(
         cost=cost,
@@ -187,8 +199,8 @@ def _bounded(state: State) -> Certificate:
     return read_off(*state, lowest_eigenvalue(state.claim, state.attempt))
 
 
-@partial(jax.jit, static_argnames="iterations", compiler_options=QUICKLY)
-def _iterated(state: State, *, iterations: int) -> Certificate:
+@partial(jax.jit, compiler_options=QUICKLY)
+def _iterated(state: State, iterations: Array) -> Certificate:
     attempt = iterate(state.claim, state.attempt, iterations)
     return read_off(state.frame, state.claim, attempt, lowest_if_unproved(state.claim, attempt))
 

@@ -20,6 +20,7 @@ from teaser_jax.certify.rotation import (
     MAX_MEASUREMENTS,
     TOLERANCE,
     certify_rotation,
+    check_count,
     check_tolerance,
     default_iterations,
 )  # fmt: skip
@@ -89,6 +90,10 @@ def certify(
         raise ValueError(f"about is {about!r}: expected 'pose', 'chain' or 'complete'.")
     if method not in ("splitting", "direct", "reference"):
         raise ValueError(f"method is {method!r}: expected 'splitting', 'direct' or 'reference'.")
+    if iterations is not None:
+        check_count("iterations", iterations)
+    if max_measurements is not None:
+        check_count("max_measurements", max_measurements)
     if is_traced(problem, solution):
         if np.ndim(solution.status) != 0:
             raise ValueError("the solution is a stack: inside jit use jax.vmap(certify).")

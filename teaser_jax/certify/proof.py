@@ -84,7 +84,7 @@ def direct(claim: Claim) -> Attempt:
     return Attempt(matrix, proved, jnp.int32(0), jnp.int32(CertifiedBy.DIRECT))
 
 
-def iterate(claim: Claim, attempt: Attempt, iterations: int) -> Attempt:
+def iterate(claim: Claim, attempt: Attempt, iterations: Int[Array, ""] | int) -> Attempt:
     """The splitting, from the closed form without the correction, in which ``attempt`` ended."""
     found = split(claim.polished, attempt.matrix, claim.shift, iterations=iterations)
     return Attempt(found.matrix, found.proved, found.rounds, jnp.int32(CertifiedBy.SPLITTING))

@@ -6,6 +6,7 @@ speaks of these measurements: it says optimal, never right.
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -74,7 +75,10 @@ def certify_rotation(
     """
     shape = _check(src, dst, rotation, method)
     mask = np.ones(shape[:-1], bool) if mask is None else mask
-    iterations = default_iterations(shape[-2]) if iterations is None else iterations
+    iterations = (
+        default_iterations(shape[-2]) if iterations is None else check_count("iterations", iterations)
+    )
+    check_count("max_measurements", max_measurements)
     if is_traced(src, dst, rotation, noise_bound, cbar2, mask, tolerance):
         if len(shape) != 2:
             raise ValueError("a stack of problems was given inside jit: use jax.vmap(certify_rotation).")
@@ -125,6 +129,13 @@ def _checked(rotation: Any) -> np.ndarray:
     if not np.all(np.isfinite(rotation)):
         raise ValueError(f"rotation is not finite: {rotation.tolist()}.")
     return rotation
+
+
+def check_count(name: str, value: Any) -> int:
+    """A whole number, 0 or above, or ValueError."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
+        raise ValueError(f"{name} is {value!r}: expected a whole number, 0 or above.")
+    return int(value)
 
 
 def check_tolerance(value: Any) -> float:

@@ -59,7 +59,11 @@ def reaches(m: Measurements, matrix: Float[Array, "n4 n4"], shift: Float[Array, 
 
 
 def split(
-    m: Measurements, start: Float[Array, "n4 n4"], shift: Float[Array, ""], *, iterations: int = 200
+    m: Measurements,
+    start: Float[Array, "n4 n4"],
+    shift: Float[Array, ""],
+    *,
+    iterations: Int[Array, ""] | int = 200,
 ) -> Split:
     """Iterate from a dual matrix until one is proved to have no eigenvalue below ``-shift``."""
     exists = existing(m)
