@@ -27,6 +27,7 @@ from teaser_jax.certify.relaxation import relaxed_rotation
 from teaser_jax.certify.rotation import (
     MAX_MEASUREMENTS,
     TOLERANCE,
+    as_mask,
     certify_rotation,
     check_count,
     check_tolerance,
@@ -124,7 +125,16 @@ def solve_rotation(
     k = np.shape(src)[0]
     mask = np.ones(k, bool) if mask is None else mask
     rounds = default_iterations(k) if iterations is None else check_count("iterations", iterations)
+    if any(np.iscomplexobj(x) for x in (src, dst) if not is_traced(x)):
+        raise ValueError("src and dst are real; complex numbers were received.")
     if is_traced(src, dst, noise_bound, cbar2, mask, tolerance):
+        mask = as_mask(mask, (k,))
+        # Rows of zeros that are masked: programs want something to look at.
+        grown = (0, max(0, 2 - k))
+        src, dst = (jnp.pad(jnp.asarray(x), (grown, (0, 0))) for x in (src, dst))
+        src, dst = (x.astype(jnp.promote_types(x.dtype, jnp.float32)) for x in (src, dst))
+        noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
+        mask = jnp.pad(mask, grown)
         if method == "sdp":
             raise ValueError("method='sdp' calls a conic solver and runs outside jit only: take 'global'.")
         src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
@@ -136,7 +146,7 @@ def solve_rotation(
                 method=proof,
             )  # fmt: skip
             found = replace(found, certificate=certificate)
-        return found
+        return replace(found, inliers=found.inliers[:k])
     rows, tolerance = compacted(src, dst, noise_bound, cbar2, mask), check_tolerance(tolerance)
     found = at_once(lambda: jax.device_get(_compiled(rows, method="gnc" if method == "gnc" else "global")))
     if method == "sdp":

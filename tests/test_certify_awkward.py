@@ -191,3 +191,126 @@ def test_more_than_it_can_look_at():
     assert not found.is_optimal
     assert_allclose(found.cost, rotation_cost(src, dst, rotation))
     assert found.lower_bound == 0
+
+
+@pytest.mark.parametrize("unused", ["zero", "nan", "masked"])
+@pytest.mark.parametrize("method", ["direct", "splitting", "reference"])
+def test_unused_rows_may_stand_anywhere(unused, method):
+    # Once padding was looked for at the end only, and the bound of a wrong candidate lay above the optimum.
+    for seed in range(4):
+        src, dst, truth = draw_vectors([17, seed], 12, 0.3)
+        candidate, mask = turned(truth, 120, seed), np.ones(12, bool)
+        known = dict(noise_bound=BOUND, method=method, iterations=5)
+        if unused == "masked":
+            mask[:4] = False
+            found = jax.jit(lambda a, b, r, m, k=known: certify_rotation(a, b, r, mask=m, **k))(
+                src, dst, candidate, mask
+            )
+        else:
+            src[:4] = 0.0 if unused == "zero" else np.nan
+            found = certify_rotation(src, dst, candidate, **known)
+        resting = rotation_cost(np.zeros((4, 3)), dst[:4], truth) if unused == "zero" else 0.0
+        least = min(rotation_cost(src[4:], dst[4:], truth), best_rotation(src[4:], dst[4:])[1]) + resting
+        assert float(found.lower_bound) <= least * (1 + 1e-6) + 1e-9
+        last = certify_rotation(src[4:], dst[4:], candidate, **known)
+        assert_allclose(float(found.lower_bound) - resting, last.lower_bound, atol=2e-2)
+
+
+def test_numbers_of_all_kinds_under_jit():
+    src, dst, rotation = draw_vectors(0, 6, 0.0)
+    whole = np.round(src * 20).astype(np.int32)
+    found = jax.jit(lambda a, b: certify_rotation(a, b, np.eye(3), noise_bound=[1.0] * 6))(whole, whole + 1)
+    outside = certify_rotation(whole, whole + 1, np.eye(3), noise_bound=1.0)
+    assert_allclose(found.suboptimality, outside.suboptimality, rtol=1e-5)
+    assert_allclose(found.rotation, outside.rotation, atol=1e-6)
+    # Truthy is used; what is claimed in float32 is rounded down.
+    masked = jax.jit(lambda a, b: certify_rotation(a, b, rotation, noise_bound=BOUND, mask=[2] * 6))(src, dst)
+    best = certify_rotation(src, dst, rotation, noise_bound=BOUND)
+    assert masked.measurements == 6
+    assert 0.99 * best.lower_bound <= masked.lower_bound <= best.cost
+    for bad in (dict(mask=[True] * 5), dict(tolerance=-1.0), dict(tolerance=np.nan)):
+        with pytest.raises(ValueError, match=f"{next(iter(bad))} "):
+            jax.jit(lambda a, b, bad=bad: certify_rotation(a, b, rotation, noise_bound=BOUND, **bad))(
+                src, dst
+            )
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (dict(tolerance=1.0), "between 0 and 1"),
+        (dict(tolerance=[1e-3]), "between 0 and 1"),
+        (dict(iterations=-5), "iterations is -5"),
+        (dict(iterations=2.5), "iterations is 2.5"),
+        (dict(iterations=10**12), "iterations"),
+        (dict(max_measurements=None), "max_measurements"),
+        (dict(noise_bound=np.inf), "finite"),
+        (dict(src=np.ones((12, 3), complex)), "complex"),
+        (dict(src=np.zeros((0, 12, 3)), dst=np.zeros((0, 12, 3))), "holds no problem"),
+        (dict(src=np.ones((2, 12, 3)), dst=np.ones((2, 12, 3)), noise_bound=np.ones(12)), "stack of 2"),
+    ],
+)
+def test_odd_parameters_are_refused(change, words):
+    src, dst, rotation = draw_vectors(0, 12, 0.0)
+    known = dict(src=src, dst=dst, rotation=rotation, noise_bound=BOUND) | change
+    with pytest.raises(ValueError, match=words):
+        certify_rotation(**known)
+
+
+def test_lengths_beyond_float64_are_undecidable():
+    src, dst, rotation = draw_vectors(0, 6, 0.0)
+    found = certify_rotation(1e200 * src, 1e200 * dst, rotation, noise_bound=1e-200)
+    assert found.status in (CertificateStatus.UNDECIDABLE, CertificateStatus.NO_MEASUREMENTS)
+    assert not found.is_optimal
+    assert found.lower_bound == 0
+
+
+def test_what_no_rotation_changes_has_no_gap():
+    dst = np.ones((4, 3))
+    found = certify_rotation(np.zeros((4, 3)), dst, np.eye(3), noise_bound=BOUND)
+    assert found.status == CertificateStatus.NO_MEASUREMENTS
+    assert found.lower_bound == found.cost == 4
+    assert found.method == CertifiedBy.NOTHING
+
+
+def test_too_large_ones_say_what_they_cost():
+    src, dst, rotation = draw_vectors(1, 12, 0.2)
+    full = certify_rotation(src, dst, 2 * rotation, noise_bound=BOUND)
+    found = certify_rotation(src, dst, 2 * rotation, noise_bound=BOUND, max_measurements=5)
+    assert_allclose(found.cost, full.cost)
+    assert_allclose(found.rotation, rotation, atol=1e-12)
+    assert_allclose(found.absolute_gap, full.cost / 12)
+
+
+def test_malformed_certificates_are_refuted_and_never_raise():
+    from dataclasses import replace
+
+    src, dst, rotation = draw_vectors(2, 12, 0.2)
+    best = certify_rotation(src, dst, rotation, noise_bound=BOUND).rotation
+    good = certify_rotation(src, dst, best, noise_bound=BOUND)
+    bad = certify_rotation(src, dst, turned(best, 20), noise_bound=BOUND)
+    known = dict(noise_bound=BOUND)
+    assert verify(src, dst, best, good, **known)
+    assert verify(src, dst, turned(best, 20), bad, **known)
+    skew, diagonal = good.dual
+    for odd in (
+        None,
+        replace(good, dual=None),
+        replace(good, lower_bound=None),
+        replace(good, dual=(skew[:3, :3], diagonal)),
+        replace(good, dual=(diagonal, skew)),
+        replace(good, dual=(skew, diagonal[:, :3, :3])),
+        replace(good, rotation=np.eye(2)),
+        replace(good, measurements=99),
+        replace(good, absolute_gap=0.0),
+        replace(good, suboptimality=np.inf),
+        replace(good, lower_bound=-5.0, suboptimality=9.0),
+        replace(good, status=2),
+    ):
+        assert not verify(src, dst, best, odd, **known)
+    for claims in (dict(is_optimal=True, status=0), dict(is_optimal=True)):
+        assert not verify(src, dst, turned(best, 20), replace(bad, **claims), **known)
+    assert not verify(src, dst, best, good, noise_bound=-BOUND)
+    assert not verify(src, dst, np.full((3, 3), np.nan), good, **known)
+    with pytest.raises(ValueError, match="do not fit"):
+        verify(src, dst[:5], best, good, **known)

@@ -207,7 +207,7 @@ def test_under_jit_and_vmap_it_says_the_same():
         (dict(rotation=np.eye(4)), "shapes"),
         (dict(rotation=np.full((3, 3), np.nan)), "not finite"),
         (dict(noise_bound=0.0), "above 0"),
-        (dict(tolerance=0.0), "above 0"),
+        (dict(tolerance=0.0), "between 0 and 1"),
         (dict(mask=np.ones(3, bool)), "mask"),
     ],
 )

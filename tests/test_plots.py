@@ -112,7 +112,7 @@ def test_the_cost_and_its_bound(solved):
     figure = plots.plot_landscape(src, dst, solved.certificate, noise_bound=p.noise_bound[keep])
     whole, close = figure.axes
     assert whole.get_title() == "Every rotation: OPTIMAL"
-    lowest = min(line.get_ydata().min() for line in whole.lines)
+    lowest = min(np.min(line.get_ydata()) for line in whole.lines)
     assert lowest >= float(solved.certificate.lower_bound) - 1e-9
     drawn(figure)
 

@@ -77,10 +77,12 @@ class Certificate:
     Attributes:
         cost: Truncated least squares cost of the rotation that was given [-].
         lower_bound: No rotation costs less: proved [-].
-        suboptimality: (cost - lower_bound) / cost; at most this share could be saved [-].
+        suboptimality: (cost - lower_bound) / cost; at most this share could be saved [-]. What was proved,
+            most of the time just the tolerance; 0 where the cost is below a millionth of c-bar squared.
         absolute_gap: The same difference over the cost of calling everything an outlier [-].
-        is_optimal: Whether the suboptimality is within the tolerance.
-        is_unique: Whether no other rotation reaches the lower bound.
+        is_optimal: Whether the suboptimality is within the tolerance, or the gap below a millionth of c-bar
+            squared: relative gaps of costs near zero say nothing.
+        is_unique: Whether no other rotation costs as little as the polished one.
         angle_bound: Every rotation that costs no more lies within this angle; infinite: none follows [rad].
         measurements: How many it is about; those of no length, which no rotation changes, are not counted.
         iterations: Rounds of the splitting, or of the conic solver.
@@ -90,7 +92,9 @@ class Certificate:
         angle: Between the given rotation and the polished one [rad].
         dual: The proof: with the measurements and ``rotation`` it can be checked by ``verify``.
         inlier_gap: No pose explains more than so many matches beyond this one's; None without a clique.
-        explained_gap: 0: the pose explains all that can be explained; 1: nothing; None without a clique.
+        explained_gap: (cost - cost of a pose that explains as many as the clique's bound allows, with no
+            residual) / the cost of these. 0: it explains all there is, exactly; 1: nothing. None without a
+            clique.
     """
 
     cost: Float[AnyArray, ""]

@@ -14,6 +14,7 @@ the row space of A, which is all but zero for a least squares fit.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import jax
@@ -108,8 +109,8 @@ class ErrorBounds:
         w = self.whole_set
         rows = [
             f"if {f'all but {w.wrong}' if w.wrong else 'all'} inliers are right: rotation within "
-            f"{np.degrees(w.angle.value):.3g} deg, translation {w.translation.value:.3g}, scale "
-            f"{w.scale.value:.3g}",
+            f"{_said(w.angle._replace(value=np.degrees(w.angle.value)))} deg, translation "
+            f"{_said(w.translation)}, scale {_said(w.scale)}",
             f"cascade, (26) - (28): scale {_said(self.scale)}, matrix {_said(self.matrix)}, translation "
             f"{_said(self.translation)}",
         ]
@@ -119,7 +120,9 @@ class ErrorBounds:
 
 
 def _said(bound: Bound) -> str:
-    return f"{bound.value:.3g}{'' if bound.informative else ' (says nothing)'}"
+    if bound.informative:
+        return f"{bound.value:.3g}"
+    return f"{bound.value:.3g} ({bound.reason or 'says nothing'})"
 
 
 def error_bounds(
@@ -145,8 +148,8 @@ def error_bounds(
     """
     if is_traced(problem, solution) or np.ndim(solution.status) != 0:
         raise ValueError("error_bounds takes one problem and runs outside jit: give it the items one by one.")
-    if wrong < 0:
-        raise ValueError(f"wrong is {wrong}: expected the number of inliers that may be wrong, 0 or more.")
+    if isinstance(wrong, bool) or not isinstance(wrong, Integral) or wrong < 0:
+        raise ValueError(f"wrong is {wrong!r}: expected the number of inliers that may be wrong, 0 or more.")
     double = lambda x: np.asarray(x, np.float64) if np.asarray(x).dtype.kind == "f" else np.asarray(x)
     p, s = jax.tree.map(double, (problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
@@ -214,6 +217,8 @@ class _Inliers:
     def displacement(self, points: np.ndarray, wrong: int) -> np.ndarray:
         """|D x + t - t0|: x is an affine combination of the inliers, and so is its displacement of theirs."""
         m = len(self.src)
+        if m - wrong < 3:
+            return np.full(len(points), np.nan)
         values = self.spread2(wrong)
         solid = m - wrong >= 4 and values[0] > 1e-18 * values[-1]
         offset = points - self.centre
@@ -247,13 +252,13 @@ def whole_set(inliers: _Inliers, wrong: int) -> WholeSet:
     else:
         angle = np.arcsin(factor / scale) if factor < scale else np.pi
     origin = float(inliers.displacement(np.zeros((1, 3)), wrong)[0])
-    size = _diameter(inliers)
+    size, flat = _diameter(inliers), "the right ones may lie in a plane"
     return WholeSet(
         wrong,
         Bound(float(matrix), bool(matrix < 2 * np.sqrt(2) * scale)),
         Bound(float(angle), bool(angle < np.pi)),
         Bound(float(scale_error), bool(scale_error < scale)),
-        Bound(origin, bool(origin < size)),
+        Bound(origin, bool(origin < size), "" if np.isfinite(origin) else flat),
         inliers,
     )
 

@@ -26,7 +26,7 @@ from teaser_jax.certify.proof import (
     read_off,
 )  # fmt: skip
 from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS
-from teaser_jax.stages.quadratic_form import in_frame_of
+from teaser_jax.stages.quadratic_form import Framed, in_frame_of
 
 QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
 
@@ -72,8 +72,8 @@ def compacted(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: Any) -> Ro
             f"expected () or ({n},), () and ({n},)."
         )
     bound = np.broadcast_to(noise_bound, (n,))
-    if not (np.all(bound[mask] > 0) and np.isfinite(cbar2) and cbar2 > 0):
-        raise ValueError("noise_bound and cbar2 must be numbers above 0.")
+    if not (np.all((bound[mask] > 0) & (bound[mask] < np.inf)) and np.isfinite(cbar2) and cbar2 > 0):
+        raise ValueError("noise_bound and cbar2 must be finite numbers above 0.")
     k = int(mask.sum())
     return padded(Rows(src[mask], dst[mask], bound[mask], cbar2, np.ones(k, bool)), padded_size(k))
 
@@ -156,27 +156,33 @@ def with_blocks(found: Certificate, n: int) -> Certificate:
 
 
 def too_large(rows: Rows, rotation: np.ndarray) -> Certificate:
-    """Nothing is proved of measurements that are too many to look at."""
-    bound = rows.noise_bound[:, None]
-    r2 = np.sum(((rows.dst - rows.src @ rotation.T) / bound) ** 2, axis=1)
-    cost = np.sum(np.where(rows.mask & np.isfinite(r2), np.minimum(r2, rows.cbar2), 0))
+    """Nothing is proved of measurements that are too many to look at; the cost is known."""
+    framed = at_once(lambda: jax.device_get(_framed(rows, rotation)))
+    count = np.sum(framed.measurements.mask)
+    r2 = np.sum((framed.measurements.dst - framed.measurements.src) ** 2, axis=1)
+    within = np.where(framed.measurements.mask, np.minimum(r2, rows.cbar2), 0).sum()
     none, false = np.float64(0), np.bool_(False)
     return Certificate(
-        cost=cost,
+        cost=within + framed.constant,
         lower_bound=none,
         suboptimality=np.float64(1),
-        absolute_gap=cost / rows.cbar2 / len(r2),
+        absolute_gap=(within + framed.constant) / (rows.cbar2 * max(count, 1)),
         is_optimal=false,
         is_unique=false,
         angle_bound=np.float64(np.inf),
-        measurements=np.int32(rows.mask.sum()),
+        measurements=np.int32(count),
         iterations=np.int32(0),
         method=np.int32(CertifiedBy.NOTHING),
         status=np.int32(CertificateStatus.TOO_LARGE),
-        rotation=rotation,
+        rotation=framed.frame,
         angle=none,
         dual=Dual(np.zeros((1, 1, 6)), np.zeros((0, 4, 4))),
     )
+
+
+@jax.jit
+def _framed(rows: Rows, rotation: Array) -> Framed:
+    return in_frame_of(rotation, **rows._asdict())
 
 
 def closed_form(rows: Rows, rotation: Array, tolerance: Array) -> tuple[Certificate, Array, Array, State]:

@@ -107,6 +107,8 @@ def certify(
         items = [(problem, solution)]
     else:
         count = len(solution.status)
+        if np.ndim(problem.cbar2) != 1 or len(problem.cbar2) != count or count == 0:
+            raise ValueError("problem and solution are not stacks of the same length.")
         items = [jax.tree.map(lambda x, i=i: x[i], (problem, solution)) for i in range(count)]
     vectors = [_host_measurements(p, s, about) for p, s in items]
     rows = [compacted(*v[:3], p.cbar2, v.mask) for v, (p, _) in zip(vectors, items, strict=True)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 
 def project_dual(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[Array, "n4 n4"]:
@@ -50,8 +50,8 @@ def project_semidefinite(w: Float[Array, "m m"]) -> Float[Array, "m m"]:
     return jnp.matmul(vectors * jnp.maximum(values, 0), vectors.T, precision=lax.Precision.HIGHEST)
 
 
-def smallest_eigenvalue(w: Float[Array, "m m"], size: Int[Array, ""] | int) -> Float[Array, ""]:
-    """Of a symmetric matrix whose last rows and columns, from ``size`` on, are padding."""
-    padding = jnp.arange(w.shape[0]) >= size
+def smallest_eigenvalue(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[Array, ""]:
+    """Of a symmetric matrix, over the blocks that exist; padding is no direction, wherever it stands."""
+    padding = jnp.repeat(exists == 0, 4, total_repeat_length=w.shape[0])
     filled = w + jnp.diag(jnp.where(padding, jnp.max(jnp.abs(w)) + 1, 0))
     return jnp.linalg.eigvalsh(0.5 * (filled + filled.T))[0]

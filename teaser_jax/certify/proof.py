@@ -62,8 +62,10 @@ def claim_of(m: Measurements, constant: Float[Array, ""], tolerance: Any) -> Cla
     turn = polish(m)
     polished = m.turned(turn)
     given, best = m.cost + constant, polished.cost + constant
-    tolerated = jnp.maximum(tolerance * given, ABSOLUTE_TOLERANCE * m.cbar2) - (given - best)
-    aim = jnp.where(tolerated > 0, tolerated, jnp.maximum(tolerance * best, ABSOLUTE_TOLERANCE * m.cbar2))
+    # A hair less than the tolerance, so that the suboptimality does not read a hair more.
+    least = ABSOLUTE_TOLERANCE * m.cbar2
+    tolerated = jnp.maximum((1 - 1e-9) * tolerance * given, least) - (given - best)
+    aim = jnp.where(tolerated > 0, tolerated, jnp.maximum((1 - 1e-9) * tolerance * best, least))
     count = jnp.sum(m.mask).astype(given.dtype) + 1
     return Claim(polished, turn, given, best, tolerated > 0, aim / count)
 
@@ -129,8 +131,8 @@ def lowest_if_unproved(claim: Claim, attempt: Attempt) -> Float[Array, ""]:
 def lowest_eigenvalue(claim: Claim, attempt: Attempt) -> Float[Array, ""]:
     """A number below all eigenvalues, by so much that a Cholesky factorisation can confirm it."""
     m = claim.polished
-    size = 4 * (jnp.sum(m.mask, dtype=jnp.int32) + 1)
-    return jnp.minimum(smallest_eigenvalue(attempt.matrix, size), 0) - 3 * rounding(m, attempt.matrix)
+    lowest = smallest_eigenvalue(attempt.matrix, existing(m))
+    return jnp.minimum(lowest, 0) - 3 * rounding(m, attempt.matrix)
 
 
 def read_off(
@@ -147,11 +149,14 @@ def read_off(
     measured = jnp.sum(m.mask)
     count = measured.astype(claim.given.dtype) + 1
     error = rounding(m, matrix)
-    zero = claim.given <= ABSOLUTE_TOLERANCE * m.cbar2
-    lower = jnp.where(zero, 0, jnp.clip(claim.best + count * lowest, 0, claim.best))
+    some, known = measured > 0, jnp.isfinite(claim.given)
+    zero = some & (claim.given <= ABSOLUTE_TOLERANCE * m.cbar2)
+    unchanged = (claim.best - m.cost) * (1 - 1e-9)  # by any rotation
+    lower = jnp.clip(claim.best + count * lowest, unchanged, claim.best)
+    lower = jnp.where(some, jnp.where(zero | ~known, 0, lower), claim.given)
     gap = claim.given - lower
     everything = m.cbar2 * jnp.maximum(measured, 1)
-    some, optimal = measured > 0, (attempt.proved | zero) & claim.possible
+    optimal = (attempt.proved | zero) & claim.possible & known
     unique, angle_bound = lax.cond(
         attempt.proved & optimal & some,
         lambda: _others(claim, matrix, error),
@@ -164,20 +169,23 @@ def read_off(
         (claim.shift <= 2 * error, CertificateStatus.UNDECIDABLE),
         (optimal, CertificateStatus.OPTIMAL),
         (~claim.possible, CertificateStatus.SUBOPTIMAL),
+        (~known, CertificateStatus.UNDECIDABLE),
         (~some, CertificateStatus.NO_MEASUREMENTS),
     ):
         status = jnp.where(holds, jnp.int32(what), status)
     return Certificate(
         cost=claim.given,
         lower_bound=lower,
-        suboptimality=jnp.where(zero, 0, gap / jnp.where(zero, 1, claim.given)),
-        absolute_gap=gap / everything,
+        suboptimality=jnp.where(zero | ~some, 0, jnp.where(known, gap / jnp.where(zero, 1, claim.given), 1)),
+        absolute_gap=jnp.where(known, gap / everything, 1),
         is_optimal=optimal & some,
         is_unique=unique,
         angle_bound=jnp.where(within < np.pi, within, jnp.inf),
         measurements=measured.astype(jnp.int32),
         iterations=attempt.iterations,
-        method=jnp.where(zero, jnp.int32(CertifiedBy.ZERO_COST), attempt.method),
+        method=jnp.where(
+            zero, jnp.int32(CertifiedBy.ZERO_COST), jnp.where(some, attempt.method, CertifiedBy.NOTHING)
+        ).astype(jnp.int32),
         status=status,
         rotation=so3.rotate(frame, claim.turn.T).T,
         angle=angle,

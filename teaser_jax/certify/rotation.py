@@ -6,14 +6,15 @@ speaks of these measurements: it says optimal, never right.
 
 from __future__ import annotations
 
-from numbers import Integral
+from dataclasses import replace
+from numbers import Integral, Real
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import certify_rows, compacted
@@ -55,19 +56,23 @@ def certify_rotation(
         noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length].
         cbar2: Truncation, c-bar squared [-].
         mask: (k,) rows to use; rows that are not finite are left out.
-        tolerance: The suboptimality that counts as optimal [-].
+        tolerance: The suboptimality that counts as optimal [-]. A gap below a millionth of c-bar squared
+            does, too.
         iterations: Cap on rounds of the splitting. None: 200, and fewer for more than 200 measurements,
             so that the work stays that of 200.
         method: ``"splitting"``, ``"direct"`` (closed form only, no iteration) or ``"reference"``
             (Algorithm 3 as published, slow). Under vmap ``"direct"`` is the one to use: the splitting goes
             on until the slowest problem ends.
-        max_measurements: More give ``TOO_LARGE``: time grows with their third power, memory with the second.
+        max_measurements: More give ``TOO_LARGE``, and under jit ``ValueError``: time grows with their third
+            power, memory with the second.
 
     Returns:
-        A ``Certificate``; of a stack, one with a leading axis.
+        A ``Certificate``; of a stack, one with a leading axis. Under jit in the dtype of the input: what is
+            proved stays proved, but ``verify`` wants float64.
 
     Raises:
-        ValueError: Shapes that do not fit, a method that is unknown, bounds that are not above 0.
+        ValueError: Shapes that do not fit, a method that is unknown, bounds that are not above 0 (under jit
+            the rows of such bounds are left out).
 
     Gradients: none, inputs are stopped.
 
@@ -84,24 +89,33 @@ def certify_rotation(
             raise ValueError("a stack of problems was given inside jit: use jax.vmap(certify_rotation).")
         if shape[0] > max_measurements:
             raise ValueError(f"{shape[0]} measurements are more than max_measurements, {max_measurements}.")
-        dtype = jnp.result_type(src)
+        dtype = jnp.promote_types(jnp.result_type(src), jnp.float32)
+        mask = as_mask(mask, shape[:1])
+        if not is_traced(tolerance):
+            check_tolerance(tolerance)
         src, dst, rotation, noise_bound, cbar2 = lax.stop_gradient((src, dst, rotation, noise_bound, cbar2))
         with jax.enable_x64(True):
             m, frame, constant = in_frame_of(
                 rotation, src, dst, noise_bound=noise_bound, cbar2=cbar2, mask=mask
             )
             found = prove(m, frame, constant, tolerance, iterations=iterations, method=method)
-            return jax.tree.map(
-                lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, found
-            )
+            return narrowed(found, dtype)
     known: dict[str, Any] = dict(iterations=iterations, method=method, most=max_measurements)
     if len(shape) == 2:
         rows = compacted(src, dst, noise_bound, cbar2, mask)
         return certify_rows(rows, _checked(rotation), check_tolerance(tolerance), **known)
-    b = shape[0]
-    bounds, cbar2s = np.asarray(noise_bound, float), np.broadcast_to(np.asarray(cbar2, float), (b,))
-    bounds = np.broadcast_to(bounds[:, None] if bounds.ndim == 1 else bounds, shape[:-1])
-    items = [compacted(src[i], dst[i], bounds[i], cbar2s[i], np.asarray(mask)[i]) for i in range(b)]
+    b, k = shape[:2]
+    mask = np.asarray(mask, bool)
+    stacked = {"noise_bound": (noise_bound, (b, k)), "cbar2": (cbar2, (b,)), "mask": (mask, (b, k))}
+    for name, (value, expected) in stacked.items():
+        if np.shape(value) not in ((), expected):
+            raise ValueError(
+                f"{name} has shape {np.shape(value)}: expected () or {expected} for a stack of {b} problems."
+            )
+    if b == 0:
+        raise ValueError("the stack holds no problem.")
+    bounds, cbar2s, masks = (np.broadcast_to(value, expected) for value, expected in stacked.values())
+    items = [compacted(src[i], dst[i], bounds[i], cbar2s[i], masks[i]) for i in range(b)]
     rotations = np.broadcast_to(_checked(rotation), (b, 3, 3))
     return certify_stack(items, rotations, check_tolerance(tolerance), **known)
 
@@ -116,6 +130,8 @@ def _check(src: Any, dst: Any, rotation: Any, method: str) -> tuple[int, ...]:
         raise ValueError(f"method is {method!r}: expected 'splitting', 'direct' or 'reference'.")
     a, b, r = np.shape(src), np.shape(dst), np.shape(rotation)
     fits = a == b and len(a) in (2, 3) and a[-1] == 3 and r in ((3, 3), (*a[:-2], 3, 3))
+    if any(np.iscomplexobj(x) for x in (src, dst, rotation) if not is_traced(x)):
+        raise ValueError("src, dst and rotation are real; complex numbers were received.")
     if not fits:
         raise ValueError(
             f"src, dst and rotation have shapes {a}, {b} and {r}: expected (k, 3), (k, 3) and (3, 3), rows "
@@ -133,13 +149,35 @@ def _checked(rotation: Any) -> np.ndarray:
 
 def check_count(name: str, value: Any) -> int:
     """A whole number, 0 or above, or ValueError."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
-        raise ValueError(f"{name} is {value!r}: expected a whole number, 0 or above.")
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= int(value) < 2**31:
+        raise ValueError(f"{name} is {value!r}: expected a whole number from 0 to 2^31 - 1.")
     return int(value)
 
 
 def check_tolerance(value: Any) -> float:
-    """A number above 0, or ValueError."""
-    if not 0 < float(value) < np.inf:
-        raise ValueError(f"tolerance is {value}: expected a number above 0.")
+    """A number between 0 and 1, or ValueError."""
+    if not isinstance(value, Real) and np.shape(value) != () or not 0 < value < 1:
+        raise ValueError(f"tolerance is {value!r}: expected a number between 0 and 1.")
     return float(value)
+
+
+def as_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Array, " k"]:
+    """The mask of traced measurements; ValueError if it is not one value a row."""
+    mask = jnp.asarray(mask)
+    if mask.shape != shape:
+        raise ValueError(f"mask has shape {mask.shape}: expected {shape}.")
+    return mask.astype(bool)
+
+
+def narrowed(found: Certificate, dtype: Any) -> Certificate:
+    """In the dtype of the input, for JAX may have no float64 outside; what is claimed is rounded down."""
+    cast = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, found)
+    if dtype == jnp.float64:
+        return cast
+    eps = 2 * jnp.finfo(dtype).eps
+    return replace(
+        cast,
+        lower_bound=cast.lower_bound * (1 - eps),
+        suboptimality=cast.suboptimality + eps,
+        absolute_gap=cast.absolute_gap + eps,
+    )

@@ -113,7 +113,6 @@ def reference(m: Measurements, *, tolerance: Float[Array, ""] | float, iteration
     """
     first, exists, mu = dual_matrix(m, reference_guess(m)), existing(m), m.cost
     count = jnp.sum(exists)
-    size = 4 * jnp.sum(exists).astype(jnp.int32)
 
     class State(NamedTuple):
         iterate: Array
@@ -123,7 +122,7 @@ def reference(m: Measurements, *, tolerance: Float[Array, ""] | float, iteration
     def once(state: State) -> State:
         cone = project_semidefinite(state.iterate)
         affine = first + project_dual(2 * cone - state.iterate - first, exists)
-        eta = jnp.maximum(-smallest_eigenvalue(affine, size), 0) * count / mu
+        eta = jnp.maximum(-smallest_eigenvalue(affine, exists), 0) * count / mu
         past, better = state.found, eta < state.best
         found = Trajectory(
             past.suboptimality.at[past.rounds].set(eta),

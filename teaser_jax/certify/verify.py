@@ -18,32 +18,64 @@ EPS = np.finfo(np.float64).eps
 
 
 def verify(
-    src: Any, dst: Any, rotation: Any, certificate: Any, *, noise_bound: Any, cbar2: float = 1.0
+    src: Any,
+    dst: Any,
+    rotation: Any,
+    certificate: Any,
+    *,
+    noise_bound: Any,
+    cbar2: float = 1.0,
+    tolerance: float = 1e-3,
 ) -> bool:
-    """Whether every claim of a certificate about a rotation holds, from the data and the stored dual alone.
+    """Whether the claims of a certificate about a rotation hold, from the data and the stored dual alone.
 
     Args:
         src, dst, noise_bound, cbar2: The measurements that were certified, those of the mask only.
         rotation: The rotation that was certified.
-        certificate: Anything with the fields of ``Certificate``.
+        certificate: Anything with the fields of ``Certificate``, in float64.
+        tolerance: The suboptimality that was to count as optimal.
 
     Returns:
-        True if its lower bound is proved and cost, suboptimality and verdict follow from it. False
-        proves nothing: not that the rotation is bad.
+        True if the lower bound is proved, and cost, gaps, count, status and ``is_optimal`` follow from it;
+        ``is_unique`` and ``angle_bound`` are not looked at. False, also for a malformed certificate, proves
+        nothing: not that the rotation is bad.
+
+    Raises:
+        ValueError: If measurements or rotation have shapes that do not fit.
     """
-    a, b, r = (np.asarray(x, np.float64) for x in (src, dst, rotation))
-    bound = np.broadcast_to(np.asarray(noise_bound, np.float64), len(a))[:, None]
+    a, b, r, bound = (np.asarray(x, np.float64) for x in (src, dst, rotation, noise_bound))
+    fits = a.shape == b.shape and a.shape[1:] == (3,) and r.shape == (3, 3) and bound.shape in ((), (len(a),))
+    if not fits:
+        raise ValueError(f"shapes {a.shape}, {b.shape}, {r.shape}, {bound.shape} do not fit.")
+    if not (
+        np.all(bound > 0) and np.all(np.isfinite(r)) and np.all(np.isfinite(a)) and np.all(np.isfinite(b))
+    ):
+        return False
+    a, b = a / np.broadcast_to(bound, len(a))[:, None], b / np.broadcast_to(bound, len(a))[:, None]
+    try:
+        return _follows(a, b, r, certificate, float(cbar2), tolerance) and is_lower_bound(
+            a, b, float(cbar2), float(certificate.lower_bound), certificate.rotation, *certificate.dual
+        )
+    except (AttributeError, IndexError, TypeError, ValueError):  # not what a certificate looks like
+        return False
+
+
+def _follows(a: np.ndarray, b: np.ndarray, r: np.ndarray, c: Any, cbar2: float, tolerance: float) -> bool:
+    """Whether everything else follows from the lower bound."""
     left, _, right = np.linalg.svd(r)
     r = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    cost = np.minimum(np.sum(((b - a @ r.T) / bound) ** 2, axis=1), cbar2).sum()
-    lower = float(certificate.lower_bound)
-    claimed = float(certificate.suboptimality)
-    consistent = bool(
-        abs(cost - float(certificate.cost)) <= 1e-9 * max(cost, cbar2)
-        and (cost - lower <= claimed * cost + 1e-9 * cbar2 or cost <= 1e-6 * cbar2)
-    )
-    return consistent and is_lower_bound(
-        a / bound, b / bound, cbar2, lower, certificate.rotation, *certificate.dual
+    cost = np.minimum(np.sum((b - a @ r.T) ** 2, axis=1), cbar2).sum()
+    turns = np.any(a != 0, axis=1) & np.any(b != 0, axis=1)
+    gap, small = cost - float(c.lower_bound), 1e-9 * max(cost, cbar2)
+    zero = cost <= 1e-6 * cbar2  # relative gaps say nothing there
+    within = gap <= max(tolerance * cost, 1e-6 * cbar2) + small
+    return bool(
+        abs(cost - float(c.cost)) <= small
+        and int(c.measurements) == turns.sum()
+        and (zero or abs(gap - float(c.suboptimality) * cost) <= small)
+        and abs(gap - float(c.absolute_gap) * cbar2 * max(turns.sum(), 1)) <= small
+        and bool(c.is_optimal) == (int(c.status) == 0)
+        and (within or not c.is_optimal)
     )
 
 
@@ -67,6 +99,8 @@ def is_lower_bound(
     turns = np.any(a != 0, axis=1) & np.any(b != 0, axis=1)
     rows = np.flatnonzero(turns)
     a, b, mu, constant = a[turns], b[turns], cost[turns].sum(), cost[~turns].sum()
+    if lower <= constant:
+        return True
     skew, diagonal = skew[np.ix_([0, *(rows + 1)], [0, *(rows + 1)])], diagonal[rows]
     if not (np.all(np.isfinite(skew)) and np.all(np.isfinite(diagonal))):
         return False
