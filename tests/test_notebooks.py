@@ -20,7 +20,11 @@ NOTEBOOKS = [
 ]
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+# The one on certificates registers a thousand problems.
+LONG = [pytest.param(p, marks=pytest.mark.slow) if p.stem.startswith("03") else p for p in NOTEBOOKS]
+
+
+@pytest.mark.parametrize("path", LONG, ids=lambda path: path.stem)
 def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in surroundings(tmp_path).items():
         monkeypatch.setenv(name, value)

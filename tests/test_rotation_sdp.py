@@ -91,6 +91,7 @@ def test_too_many_and_inside_jit_are_refused(small):
         jax.jit(lambda p: tj.solve(p, tj.Settings(rotation="sdp", clique="greedy")))(problem)
 
 
+@pytest.mark.slow
 def test_in_the_cascade(solved, small):
     result = tj.register(
         small.src, small.dst, noise_bound=small.noise_bound, settings=tj.Settings(rotation="sdp")

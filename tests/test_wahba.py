@@ -26,7 +26,7 @@ def test_the_rotation_the_sets_the_cost_and_the_proof(method):
     assert "30 measurements" in repr(found)
 
 
-@pytest.mark.parametrize(("k", "runs"), [(40, 10), (100, 3)])
+@pytest.mark.parametrize(("k", "runs"), [(40, 10), pytest.param(100, 10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wrong", [0.8, 0.9])
 def test_hard_rates_are_solved_and_most_are_certified(k, runs, wrong):
     certified = 0
