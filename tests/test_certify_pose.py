@@ -99,7 +99,7 @@ def test_a_stack_of_solutions_outside_jit():
 
 
 def test_the_identity_explains_nothing_on_the_protocol():
-    for n, rate in ((100, 0.5), (1000, 0.95), (1000, 0.99)):
+    for n, rate in ((100, 0.5), (1000, 0.99)):
         drawn = tj.synthetic.random_problem(1, n=n, outlier_rate=rate)
         result = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
         r = np.linalg.norm(drawn.dst - drawn.src, axis=1) / drawn.noise_bound

