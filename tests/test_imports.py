@@ -25,11 +25,12 @@ ORDER = [
     "certify.certificate", "certify.proof", "certify.host", "certify.stack", "certify.rotation",
     "certify.relaxation",
     "certify.pose", "certify.error_bounds", "certify.verify", "wahba",
-    "packing", "register", "profile",
+    "packing", "summary", "register", "profile",
     "metrics", "synthetic", "files", "plots.stages", "plots.proofs", "cli",
 ]  # fmt: skip
-# The search returns to the module that calls it for one thing: networkx, where numba cannot be had.
-KNOWN = {("stages.clique", "stages.clique_search")}
+# The search returns to the module that calls it for one thing: networkx, where numba cannot be had. The
+# summary names the type of what it is about, for type checkers only.
+KNOWN = {("stages.clique", "stages.clique_search"), ("summary", "register")}
 
 
 def modules() -> dict[str, Path]:

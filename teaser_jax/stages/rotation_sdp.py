@@ -31,7 +31,8 @@ class Relaxation:
     """What the conic solver returned for (23), and what follows from it by Theorem 13.
 
     Attributes:
-        value: Cost of the relaxation, tr(Q Z) [-]. Where it converged no rotation costs less, up to its accuracy.
+        value: Cost of the relaxation, tr(Q Z) [-]. Where it converged no rotation costs less, up to its
+            accuracy.
         rank: Eigenvalues of Z above a thousandth of the largest.
         second_eigenvalue: The second largest eigenvalue of Z over the largest: zero where rank is one.
         gap: (cost of the rounded rotation - value) / cost [-].
