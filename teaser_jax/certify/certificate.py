@@ -44,7 +44,7 @@ _ADVICE = {
         "tiny against their lengths; ask for a larger tolerance."
     ),
     CertificateStatus.TOO_LARGE: (
-        "More measurements than max_measurements: raise it, or certify outside jit, where sizes are exact."
+        "More measurements than max_measurements: raise it, or certify outside jit, where it is 1000."
     ),
     CertificateStatus.NO_MEASUREMENTS: "There is nothing to certify: no usable measurement.",
 }
