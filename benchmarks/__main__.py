@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks import accuracy, baseline, certificate, clique, cold, growth, speed, stream, trust
+from benchmarks import accuracy, baseline, certificate, clique, cold, growth, learning, speed, stream, trust
 
 HERE = Path(__file__).parent
 BENCHMARKS = {
@@ -19,6 +19,7 @@ BENCHMARKS = {
     "cold": cold,
     "growth": growth,
     "certificate": certificate,
+    "learning": learning,
 }
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import numpy as np
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
+from benchmarks.models import bunny_mesh
 from benchmarks.problems import DATA, protocol
 from benchmarks.processes import forget_peak, in_child, peak_megabytes
 
@@ -46,13 +48,10 @@ def vectors(seed: tuple[int, ...], k: int, rate: float) -> tuple[np.ndarray, np.
     return src, dst, rotation
 
 
-def _points(path) -> np.ndarray:
-    """Vertices of a text PLY, scaled into the unit cube."""
-    lines = path.read_text().splitlines()
-    count = next(int(line.split()[2]) for line in lines if line.startswith("element vertex"))
-    start = lines.index("end_header") + 1
-    points = np.array([line.split()[:3] for line in lines[start : start + count]], float)
-    points -= points.min(axis=0)
+def _points(path: Path) -> np.ndarray:
+    """Vertices of the Bunny, scaled into the unit cube."""
+    points = bunny_mesh(path).vertices
+    points = points - points.min(axis=0)
     return points / points.max()
 
 

@@ -1,6 +1,6 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
 
-from teaser_jax import files, metrics, plots, so3, synthetic
+from teaser_jax import files, learn, metrics, plots, so3, synthetic
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
 from teaser_jax.certify.error_bounds import ErrorBounds, error_bounds
 from teaser_jax.certify.pose import certify
@@ -9,16 +9,18 @@ from teaser_jax.certify.verify import verify
 from teaser_jax.problem import make_problem, stack_problems
 from teaser_jax.profile import Profile, profile
 from teaser_jax.register import Registration, register, warmup
+from teaser_jax.soft import SoftSolution, soft_solve
 from teaser_jax.solve import refit, select, solve
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
+from teaser_jax.uncertainty import Uncertainty, covariance
 from teaser_jax.wahba import RotationSolution, solve_rotation
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Certificate", "CertificateStatus", "CertifiedBy", "ErrorBounds", "Pose", "Problem", "Profile",
-    "Registration", "RotationSolution", "Selection", "Settings", "Solution", "Status",
-    "certify", "certify_rotation", "error_bounds", "files", "make_problem", "metrics", "plots", "profile",
-    "refit", "register", "select", "so3", "solve", "solve_rotation", "stack_problems", "synthetic", "verify",
-    "warmup",
+    "Registration", "RotationSolution", "Selection", "Settings", "SoftSolution", "Solution", "Status",
+    "Uncertainty", "certify", "certify_rotation", "covariance", "error_bounds", "files", "learn",
+    "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "so3", "soft_solve",
+    "solve", "solve_rotation", "stack_problems", "synthetic", "verify", "warmup",
 ]  # fmt: skip

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 AnyArray: TypeAlias = Any  # numpy's on the host, JAX's on the device: what lives on both sides
 
@@ -178,18 +178,31 @@ def _nearest_rotation_jvp(primals: tuple, tangents: tuple) -> tuple:
     (matrix,), (d_matrix,) = primals, tangents
     high = lax.Precision.HIGHEST
     rotation = nearest_rotation(matrix)
-    product = jnp.einsum("ji,jk->ik", rotation, matrix, precision=high)
+    turned = jnp.einsum("ji,jk->ik", rotation, d_matrix, precision=high)
+    adjugate, determinant, ambiguous = _system(matrix, rotation)
+    inverse = jnp.where(ambiguous, 0, adjugate / jnp.where(ambiguous, 1, determinant))
+    omega = jnp.einsum("ij,j->i", inverse, _axial(turned), precision=high)
+    return rotation, jnp.einsum("ij,jk->ik", rotation, hat(omega), precision=high)
+
+
+def _system(
+    matrix: Float[Array, "3 3"], rotation: Float[Array, "3 3"]
+) -> tuple[Float[Array, "3 3"], Float[Array, ""], Bool[Array, ""]]:
+    """Adjugate and determinant of tr(M) I - M, and whether it is singular."""
+    product = jnp.einsum("ji,jk->ik", rotation, matrix, precision=lax.Precision.HIGHEST)
     product = 0.5 * (product + product.T)
     trace = jnp.trace(product)
     system = trace * jnp.eye(3, dtype=matrix.dtype) - product
-    turned = jnp.einsum("ji,jk->ik", rotation, d_matrix, precision=high)
     c0, c1, c2 = system[:, 0], system[:, 1], system[:, 2]
-    rows = jnp.stack([_cross(c1, c2), _cross(c2, c0), _cross(c0, c1)])  # adjugate
-    determinant = jnp.sum(c0 * rows[0])
-    ambiguous = determinant <= 64 * jnp.finfo(matrix.dtype).eps * jnp.abs(trace) ** 3
-    inverse = jnp.where(ambiguous, 0, rows / jnp.where(ambiguous, 1, determinant))
-    omega = jnp.einsum("ij,j->i", inverse, _axial(turned), precision=high)
-    return rotation, jnp.einsum("ij,jk->ik", rotation, hat(omega), precision=high)
+    adjugate = jnp.stack([_cross(c1, c2), _cross(c2, c0), _cross(c0, c1)])
+    determinant = jnp.sum(c0 * adjugate[0])
+    return adjugate, determinant, determinant <= 64 * jnp.finfo(matrix.dtype).eps * jnp.abs(trace) ** 3
+
+
+def is_ambiguous(matrix: Float[Array, "3 3"]) -> Bool[Array, ""]:
+    """Whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirror image."""
+    matrix = lax.stop_gradient(matrix)
+    return _system(matrix, nearest_rotation(matrix))[2]
 
 
 def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "..."]:

@@ -66,7 +66,8 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
         The pose from the source to the target frame and what it rests on. Finite always.
 
     Gradients: exact through ``refit`` as long as the chosen sets do not change, that is almost
-    everywhere; the sets themselves carry none.
+    everywhere; the sets themselves carry none (``soft_solve`` differentiates through them, too). Zero
+    where the rotation is ambiguous, and then the status is not OK.
 
     References: Yang, Shi, Carlone, T-RO 2020, Algorithm 1 with MCIS (section VI-D) and GNC.
     """
@@ -252,7 +253,7 @@ def refit(problem: Problem, selection: Selection) -> Pose:
     on the frozen sets with binary weights. Weights are confidence_i / beta_i^2.
 
     Gradients: exact in points, bounds, known scale and confidences; memory O(n) (complete TIM
-    graphs and voted scales: one slice of the pairs at a time).
+    graphs and voted scales: one slice of the pairs at a time). Zero where the rotation is ambiguous.
     """
     return lax.cond(
         selection.refined,
@@ -270,7 +271,8 @@ def _refit(problem: Problem, selection: Selection, *, refined: bool) -> Pose:
     p, _ = usable_rows(problem)
     if refined:
         weights = jnp.where(selection.inliers, p.confidence / p.noise_bound**2, 0)
-        return fit_similarity(p.src, p.dst, weights, p.scale).pose
+        fit = fit_similarity(p.src, p.dst, weights, p.scale)
+        return _constant_if_ambiguous(fit.pose, fit.correlation)
     if p.scale is not None:
         scale = p.scale
     else:
@@ -278,10 +280,17 @@ def _refit(problem: Problem, selection: Selection, *, refined: bool) -> Pose:
         scale = _positive(
             scale_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, selection.scale_pairs, pairs=p.pairs)
         )
-    rotation = _rotation_of(p, selection.clique, selection.rotation)
+    h = _correlation_of(p, selection.clique, selection.rotation)
+    rotation = so3.nearest_rotation(h)
     offsets = p.dst - scale * so3.rotate(rotation, p.src)
     translation = translation_of_points(offsets, p.noise_bound, p.confidence, selection.translation)
-    return Pose(rotation, translation, scale)
+    return _constant_if_ambiguous(Pose(rotation, translation, scale), h)
+
+
+def _constant_if_ambiguous(pose: Pose, correlation: Float[Array, "3 3"]) -> Pose:
+    """A pose whose rotation could as well be another has no derivative that means anything: it gets zero."""
+    ambiguous = so3.is_ambiguous(correlation)
+    return jax.tree.map(lambda x: jnp.where(ambiguous, lax.stop_gradient(x), x), pose)
 
 
 def _positive(scale: Float[Array, ""]) -> Float[Array, ""]:
@@ -303,16 +312,14 @@ def _listed_tims(p: Problem, members: Array, scale: Array) -> tuple[Array, Array
     return a, b, bounds, usable_pairs(pairs, members)
 
 
-def _rotation_of(p: Problem, members: Array, chosen: Array) -> Float[Array, "3 3"]:
-    """The closed-form rotation on the chosen TIMs (12); its scale does not matter."""
+def _correlation_of(p: Problem, members: Array, chosen: Array) -> Float[Array, "3 3"]:
+    """What decides the closed-form rotation (12) on the chosen TIMs; the scale does not matter to it."""
     if chosen.dtype == jnp.uint32:
-        h = correlation_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, chosen)
-    else:
-        pairs = ring_tims(members) if p.pairs is None else p.pairs
-        weight = p.confidence[pairs[:, 0]] * p.confidence[pairs[:, 1]]
-        weight = jnp.where(chosen, weight / tim_bounds(p.noise_bound, pairs) ** 2, 0)
-        h = correlation(weight, tims(p.src, pairs), tims(p.dst, pairs))
-    return so3.nearest_rotation(h)
+        return correlation_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, chosen)
+    pairs = ring_tims(members) if p.pairs is None else p.pairs
+    weight = p.confidence[pairs[:, 0]] * p.confidence[pairs[:, 1]]
+    weight = jnp.where(chosen, weight / tim_bounds(p.noise_bound, pairs) ** 2, 0)
+    return correlation(weight, tims(p.src, pairs), tims(p.dst, pairs))
 
 
 @jax.jit  # traced once, not by every stage

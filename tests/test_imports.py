@@ -18,15 +18,17 @@ ORDER = [
     "stages.invariants", "stages.bits", "stages.voting", "stages.histogram_voting", "stages.scale",
     "stages.consistency",
     "stages.clique_reduction", "stages.clique_branching", "stages.clique", "stages.clique_search",
-    "stages.rotation", "stages.quadratic_form", "stages.rotation_global", "stages.rotation_sdp",
+    "stages.gnc", "stages.rotation", "stages.quadratic_form", "stages.rotation_global", "stages.rotation_sdp",
     "stages.translation", "stages.refinement", "stages.trust",
-    "problem", "solve", "compilation",
+    "problem", "solve", "soft", "uncertainty", "compilation",
     "certify.dual", "certify.projection", "certify.splitting",
     "certify.certificate", "certify.proof", "certify.host", "certify.stack", "certify.rotation",
     "certify.relaxation",
     "certify.pose", "certify.error_bounds", "certify.verify", "wahba",
     "packing", "summary", "register", "profile",
-    "metrics", "synthetic", "files", "plots.stages", "plots.proofs", "cli",
+    "metrics", "synthetic.models", "synthetic.protocol", "synthetic.solids", "synthetic.scans",
+    "learn.matching", "learn.losses", "learn.teacher", "learn.network", "learn.training",
+    "files", "plots.stages", "plots.proofs", "cli",
 ]  # fmt: skip
 # The search returns to the module that calls it for one thing: networkx, where numba cannot be had. The
 # summary names the type of what it is about, for type checkers only.

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 import teaser_jax as tj
 from teaser_jax import synthetic
+from teaser_jax.synthetic import models
 
 PROTOCOLS = (synthetic.random_problem, synthetic.descriptor_problem)
 
@@ -87,7 +88,7 @@ def test_no_rotation_or_reflection_maps_the_teapot_onto_itself():
 
 def test_the_teapot_is_sampled_evenly():
     pot = synthetic.teapot(20_000)
-    assert np.abs(synthetic._teapot_distance(pot)).max() < 1e-6
+    assert np.abs(models._teapot_distance(pot)).max() < 1e-6
     # On a surface the number of neighbours within r grows with r^2 at the same rate everywhere.
     near = cKDTree(pot).query_ball_point(pot[:2000], 0.05, return_length=True)
     assert near.std() / near.mean() < 0.25

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
 from teaser_jax.stages import bits
+from teaser_jax.stages.gnc import gnc_weights
 from teaser_jax.stages.invariants import PairSlice, fold_pairs, words
 
 Weigh = Callable[[Array], Array]  # squared residuals in units of their bounds -> weights in [0, 1]
@@ -133,9 +134,8 @@ def estimate_rotation(
 ) -> Rotation:
     """GNC-TLS: a rotation and the TIMs that agree with it.
 
-    Residuals are in units of their bounds. With control mu a TIM weighs 1 below
-    mu/(mu+1) c^2, 0 above (mu+1)/mu c^2, and c sqrt(mu (mu+1)) / r - mu between. The first fit
-    uses all TIMs; if all agree with it, it is final.
+    The first fit uses all TIMs; if all agree with it, it is final. Otherwise they are weighed by
+    ``gnc_weights``, under a control that grows round by round.
 
     Gradients: none, the members are a choice; inputs must be stopped by the caller.
 
@@ -144,10 +144,7 @@ def estimate_rotation(
     cbar2 = jnp.asarray(cbar2, dtype)
 
     def weigh(gnc_mu: Array) -> Weigh:
-        # Clipping reproduces both thresholds of the piecewise formula.
-        height = cbar2 * gnc_mu * (gnc_mu + 1)
-        floor = jnp.finfo(dtype).tiny
-        return lambda r2: jnp.clip(jnp.sqrt(height / jnp.maximum(r2, floor)) - gnc_mu, 0, 1)
+        return lambda r2: gnc_weights(r2, gnc_mu, cbar2)
 
     class Round(NamedTuple):
         correlation: Array

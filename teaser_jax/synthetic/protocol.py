@@ -1,34 +1,22 @@
 """Random registration problems with known answers: the paper's protocol (section XI-A) and relatives.
 
-Everything is numpy on the host and follows from the seed alone. No data files: the default model
-is a small teapot, a solid of blended primitives without any symmetry, so that its pose is unique.
+Everything is numpy on the host and follows from the seed alone.
 """
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax import so3
+from teaser_jax.synthetic.models import Mesh, Points, Seed, sample_model
 from teaser_jax.types import Pose
 
 SIGMA = 0.01
 BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimensions
-
-Points: TypeAlias = Float[np.ndarray, "n 3"]
-Seed: TypeAlias = int | Sequence[int]
-
-
-class Mesh(NamedTuple):
-    """A triangle mesh to sample from: a model with any number of surface points."""
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,74 +162,6 @@ def bounded_noise(rng: np.random.Generator, n: int, sigma: float, bound: float) 
     while (outside := np.linalg.norm(noise, axis=1) > bound).any():
         noise[outside] = sigma * rng.standard_normal((outside.sum(), 3))
     return noise
-
-
-def sample_model(rng: np.random.Generator, n: int, model: Points | Mesh | None = None) -> Points:
-    """``n`` different points of a model, resized together to fit [0, 1]^3."""
-    if isinstance(model, Mesh):
-        points = _on_triangles(rng, n, model)
-    else:
-        pool = teapot(max(n, 20_000)) if model is None else np.asarray(model, float)
-        if n > len(pool):
-            raise ValueError(f"the model has {len(pool)} points, fewer than n = {n}: give a Mesh instead.")
-        points = pool[rng.choice(len(pool), n, replace=False)]
-    low = points.min(axis=0)
-    extent = (points.max(axis=0) - low).max()
-    return (points - low) / (extent if extent > 0 else 1)
-
-
-@functools.lru_cache(maxsize=2)
-def teapot(n: int) -> Points:
-    """``n`` points, uniform on the surface of the teapot; always the same ones, read-only."""
-    rng, found = np.random.default_rng(0), np.zeros((0, 3))
-    while len(found) < n:
-        x = rng.uniform((-1, -0.7, -0.6), (1.1, 0.8, 0.8), (50_000, 3))
-        x = x[np.abs(_teapot_distance(x)) < 0.05]
-        value, slope = _teapot_distance(x), _teapot_slope(x)
-        # A thin shell of constant thickness has as much volume where the surface has area.
-        thin = np.abs(value) < 0.02 * np.linalg.norm(slope, axis=1)
-        x, value, slope = x[thin], value[thin], slope[thin]
-        for _ in range(3):  # Newton's method onto the surface
-            x = x - (value / np.sum(slope**2, axis=1))[:, None] * slope
-            value, slope = _teapot_distance(x), _teapot_slope(x)
-        found = np.concatenate([found, x])
-    found = found[:n]
-    found.flags.writeable = False
-    return found
-
-
-def _teapot_distance(x: Points) -> Float[np.ndarray, " n"]:
-    """Negative inside, zero on the surface: a blend of simple solids, z up, spout along x."""
-
-    def ball(centre: Sequence[float], radii: Any) -> np.ndarray:
-        return (np.linalg.norm((x - centre) / radii, axis=1) - 1) * np.min(radii)
-
-    def blend(a: np.ndarray, b: np.ndarray, width: float = 0.07) -> np.ndarray:
-        share = np.clip(0.5 + 0.5 * (b - a) / width, 0, 1)
-        return b + (a - b) * share - width * share * (1 - share)
-
-    body = ball((0, 0, 0), np.array([0.62, 0.62, 0.48]))
-    knob = ball((0, 0, 0.54), 0.1)
-    badge = ball((0.1, 0.6, 0.05), 0.12)  # on one side only: not even a mirror image fits
-    ring = np.hypot(np.hypot(x[:, 0] + 0.62, x[:, 2] - 0.06) - 0.27, x[:, 1]) - 0.06
-    start, along = np.array([0.4, 0, -0.12]), np.array([0.62, 0, 0.52])
-    position = np.clip((x - start) @ along / (along @ along), 0, 1)
-    spout = np.linalg.norm(x - start - position[:, None] * along, axis=1) - (0.15 - 0.09 * position)
-    return functools.reduce(blend, (body, knob, badge, ring, spout))
-
-
-def _teapot_slope(x: Points, step: float = 1e-5) -> Points:
-    central = [_teapot_distance(x + e) - _teapot_distance(x - e) for e in step * np.eye(3)]
-    return np.stack(central, axis=1) / (2 * step)
-
-
-def _on_triangles(rng: np.random.Generator, n: int, mesh: Mesh) -> Points:
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices, float)[np.asarray(mesh.faces)], 1, 0)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    face = rng.choice(len(area), n, p=area / area.sum())
-    u, v = rng.random((2, n, 1))
-    u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))  # folds the square onto the triangle
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
 
 
 def _right_matches(

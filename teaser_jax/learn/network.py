@@ -1,0 +1,179 @@
+"""A small network that describes the points of a scan, the same however the scan is turned.
+
+First, what pairs of neighbours say without any frame: the angles of two normals with the line between
+them and with each other, and the distance, as soft histograms over three neighbourhoods. No derivative
+is needed there. Then a graph network: each point hears the mean of its neighbours in three rings.
+Rings are matrices and means are products of matrices, which any device does well.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+BINS = 5
+PREFERENCE = 0.01  # for the direction to the sensor as a normal, against a spread of the radius squared
+LEVELS = (0.25, 0.5, 1.0)  # neighbourhoods and rings, as shares of the reach
+FEATURES = len(LEVELS) * 4 * BINS
+Parameters = dict[str, Any]
+
+
+class Scan(NamedTuple):
+    """A scan as the network takes it.
+
+    Attributes:
+        points: [length].
+        features: What each neighbourhood says; the same in every frame.
+        mask: Points that exist; padding is False.
+        reach: The largest distance of a neighbour [length].
+    """
+
+    points: Float[Array, "*batch n 3"]
+    features: Float[Array, "*batch n f"]
+    mask: Bool[Array, "*batch n"]
+    reach: Float[Array, "*batch"]
+
+
+@jax.jit
+def read_scan(
+    points: Float[Array, "n 3"],
+    viewpoint: Float[Array, "3"],
+    mask: Bool[Array, " n"] | None = None,
+    *,
+    reach: float | Float[Array, ""] = 0.32,
+) -> Scan:
+    """The geometry around every point: normals towards the sensor, and histograms of pairs.
+
+    Args:
+        points: A scan [length].
+        viewpoint: Where the sensor stood, in the frame of the scan; it tells outside from inside.
+        mask: Points that exist; None: all.
+        reach: How far a neighbour can be [length]: a third of an object.
+
+    Gradients: none; the scan is data.
+
+    References: Drost et al., CVPR 2010 (pairs of oriented points); Rusu et al., ICRA 2009 (histograms).
+    """
+    points, viewpoint = lax.stop_gradient((points, viewpoint))
+    mask = jnp.ones(len(points), bool) if mask is None else mask
+    points = jnp.where(mask[:, None], points, 0)
+    difference = points[None] - points[:, None]
+    distance = jnp.sqrt(jnp.sum(difference**2, axis=2))
+    pairs = mask[:, None] & mask & ~jnp.eye(len(points), dtype=bool)
+    radius = LEVELS[0] * reach
+    normals = _normals(points, viewpoint, mask, pairs & (distance < radius), radius)
+    direction = difference / jnp.where(distance > 0, distance, 1)[..., None]
+    cosines = (
+        jnp.einsum("ijk,ik->ij", direction, normals),
+        jnp.einsum("ijk,jk->ij", direction, normals),
+        normals @ normals.T,
+    )
+    angles = jnp.concatenate([_soft_bins(c, -1.0, 1.0) for c in cosines], axis=2)
+    found = []
+    for level in LEVELS:
+        near = (pairs & (distance < level * reach)).astype(points.dtype)
+        near = near / jnp.maximum(jnp.sum(near, axis=1, keepdims=True), 1)
+        lengths = _soft_bins(distance / (level * reach), 0.0, 1.0)
+        found += [jnp.einsum("ij,ijm->im", near, x) for x in (angles, lengths)]
+    return Scan(points, jnp.concatenate(found, axis=1), mask, jnp.asarray(reach, points.dtype))
+
+
+def init_network(
+    key: PRNGKeyArray, *, width: int = 64, messages: int = 24, layers: int = 3, size: int = 24
+) -> Parameters:
+    """Random weights, as a pytree: ``width`` numbers a point inside, ``size`` in its descriptor."""
+    keys = iter(jax.random.split(key, 3 + 3 * layers))
+    heard = width + messages * len(LEVELS)
+    return {
+        "enter": [_dense(next(keys), FEATURES, width), _dense(next(keys), width, width)],
+        "layers": [
+            {
+                "send": _dense(next(keys), width, messages),
+                "think": [_dense(next(keys), heard, width), _dense(next(keys), width, width)],
+            }
+            for _ in range(layers)
+        ],
+        "leave": _dense(next(keys), width * (layers + 1), size),
+    }
+
+
+def describe(parameters: Parameters, scan: Scan) -> Float[Array, "n d"]:
+    """Descriptors of length 1, the same in every frame; those of masked points mean nothing.
+
+    Gradients: exact in the parameters.
+    """
+    rings = _rings(scan)
+    state = _normalise(_perceptron(parameters["enter"], _normalise(scan.features)))
+    states = [state]
+    for layer in parameters["layers"]:
+        message = jax.nn.relu(_apply(layer["send"], state))
+        heard = [state] + [(ring @ message) * share for ring, share in rings]
+        state = state + _normalise(_perceptron(layer["think"], jnp.concatenate(heard, axis=1)))
+        states.append(state)
+    found = _apply(parameters["leave"], jnp.concatenate(states, axis=1))
+    return found * lax.rsqrt(jnp.sum(found * found, axis=1, keepdims=True) + 1e-12)
+
+
+def _dense(key: PRNGKeyArray, inputs: int, outputs: int) -> dict[str, Array]:
+    weights = jax.random.normal(key, (inputs, outputs)) * np.sqrt(2 / inputs)
+    return {"weights": weights, "bias": jnp.zeros(outputs)}
+
+
+def _apply(layer: dict[str, Array], x: Array) -> Array:
+    return x @ layer["weights"] + layer["bias"]
+
+
+def _perceptron(layers: list[dict[str, Array]], x: Array) -> Array:
+    return _apply(layers[1], jax.nn.relu(_apply(layers[0], x)))
+
+
+def _normalise(x: Array) -> Array:
+    x = x - jnp.mean(x, axis=-1, keepdims=True)
+    return x * lax.rsqrt(jnp.mean(x * x, axis=-1, keepdims=True) + 1e-5)
+
+
+def _rings(scan: Scan) -> list[tuple[Array, Array]]:
+    """Who is in which ring of whom, as 0 and 1, and one over how many: the mean is a product and a factor."""
+    x = lax.stop_gradient(scan.points)
+    length2 = jnp.sum(x * x, axis=1)
+    distance2 = length2[:, None] + length2 - 2 * x @ x.T
+    found, inner = [], jnp.asarray(-jnp.inf, x.dtype)
+    for level in LEVELS:
+        outer = (level * scan.reach) ** 2
+        ring = ((distance2 >= inner) & (distance2 < outer) & scan.mask).astype(x.dtype)
+        found.append((ring, 1 / jnp.maximum(jnp.sum(ring, axis=1, keepdims=True), 1)))
+        inner = outer
+    return found
+
+
+def _normals(
+    points: Array, viewpoint: Array, mask: Array, near: Bool[Array, "n n"], radius: Array | float
+) -> Float[Array, "n 3"]:
+    """The direction in which a neighbourhood spreads least, on the side of the sensor.
+
+    Two or three neighbours leave that open: where they do, the direction to the sensor is preferred.
+    """
+    weight = (near | jnp.eye(len(points), dtype=bool)).astype(points.dtype)
+    count = jnp.sum(weight, axis=1, keepdims=True)
+    present = mask.astype(points.dtype)
+    centred = points - present @ points / jnp.maximum(jnp.sum(present), 1)  # so that squares do not cancel
+    mean = weight @ centred / count
+    outer = (centred[:, :, None] * centred[:, None, :]).reshape(len(points), 9)
+    spread = (weight @ outer / count).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
+    sight = viewpoint - points
+    sight = sight * lax.rsqrt(jnp.maximum(jnp.sum(sight**2, axis=1, keepdims=True), 1e-12))
+    preferred = PREFERENCE * radius**2 * sight[:, :, None] * sight[:, None, :]
+    normals = jnp.linalg.eigh(spread - preferred)[1][:, :, 0]
+    outwards = jnp.sum(normals * sight, axis=1, keepdims=True)
+    return jnp.where(outwards < 0, -normals, normals)
+
+
+def _soft_bins(x: Array, low: float, high: float) -> Array:
+    """How close a number is to each of a few places, as Gaussian bumps that overlap."""
+    places, step = jnp.linspace(low, high, BINS, dtype=x.dtype), (high - low) / (BINS - 1)
+    return jnp.exp(-0.75 * ((x[..., None] - places) / step) ** 2)

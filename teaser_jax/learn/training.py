@@ -1,0 +1,181 @@
+"""A training loop for descriptors that needs no pose labels: the solver makes them as training goes.
+
+Each step matches a batch of scan pairs with the network as it is, lets the teacher solve them, and
+pulls descriptors of the same place together, under the poses that the teacher trusts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from teaser_jax.learn.losses import masked_mean, matching_loss, rotation_loss
+from teaser_jax.learn.matching import match
+from teaser_jax.learn.network import Parameters, Scan, describe, read_scan
+from teaser_jax.learn.teacher import Labels, teacher
+from teaser_jax.types import Pose
+
+
+class Pairs(NamedTuple):
+    """Pairs of scans, stacked along the first axis.
+
+    Attributes:
+        src, dst: Both scans of each pair.
+        truth: ``T_dst_src``, for ``truth_labels`` and for statistics; None: not known, and not needed.
+    """
+
+    src: Scan
+    dst: Scan
+    truth: Pose | None = None
+
+
+class History(NamedTuple):
+    """What training did, step by step.
+
+    Attributes:
+        loss: Of the trusted pairs [nat].
+        trusted: Which pairs of the batch the teacher trusted.
+        angle: Between the teacher's rotation and the true one [rad]; NaN where the truth is not known.
+    """
+
+    loss: Float[Array, " steps"]
+    trusted: Bool[Array, "steps batch"]
+    angle: Float[Array, "steps batch"]
+
+
+Teach = Callable[[Parameters, Pairs, float], Labels]  # network, a batch, noise bound
+
+
+def read_pairs(pairs: Any, *, reach: float = 0.32) -> Pairs:
+    """Pairs for training from ``synthetic.ScanPair`` or anything with its fields, all of one size.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    pairs = list(pairs)
+    if not pairs:
+        raise ValueError("read_pairs received no pair.")
+
+    def read(points: list, viewpoints: list) -> Scan:
+        both = jnp.asarray(np.stack(points), jnp.float32), jnp.asarray(np.stack(viewpoints), jnp.float32)
+        # One after another: every pair of points of a scan is looked at.
+        return lax.map(lambda x: read_scan(*x, reach=reach), both)
+
+    truth = jax.tree.map(lambda *x: jnp.asarray(np.stack(x), jnp.float32), *[p.truth for p in pairs])
+    return Pairs(
+        read([p.src for p in pairs], [p.src_viewpoint for p in pairs]),
+        read([p.dst for p in pairs], [p.dst_viewpoint for p in pairs]),
+        truth,
+    )
+
+
+def match_scans(
+    parameters: Parameters, pairs: Pairs
+) -> tuple[Float[Array, "batch n 3"], Float[Array, "batch n 3"], Bool[Array, "batch n"]]:
+    """The matches that a network makes: points of the source, their counterparts, and which to use.
+
+    Every point has its most similar counterpart. Asking that pairs choose each other would make the share of
+    right matches higher and their number lower, and the poses less accurate.
+    """
+
+    def one(src: Scan, dst: Scan) -> tuple[Array, Array, Array]:
+        found = match(
+            describe(parameters, src), describe(parameters, dst),
+            mutual=False, src_mask=src.mask, dst_mask=dst.mask,
+        )  # fmt: skip
+        return src.points, dst.points[found.counterpart], found.mask
+
+    return jax.vmap(one)(pairs.src, pairs.dst)
+
+
+def solver_labels(parameters: Parameters, pairs: Pairs, noise_bound: float) -> Labels:
+    """Labels by the solver, from matches of the network as it is."""
+    src, dst, mask = match_scans(parameters, pairs)
+    return teacher(src, dst, noise_bound=noise_bound, mask=mask)
+
+
+def truth_labels(parameters: Parameters, pairs: Pairs, noise_bound: float) -> Labels:
+    """Labels for ordinary supervision: true poses, all of them trusted."""
+    assert pairs.truth is not None, "the pairs have no true poses"
+    batch, n = pairs.src.mask.shape
+    nothing = jnp.zeros((batch, n), bool)
+    return Labels(pairs.truth, nothing, jnp.ones(batch, bool), jnp.zeros(batch, jnp.int32))
+
+
+@partial(jax.jit, static_argnames=("optimizer", "steps", "batch", "points", "labels"))
+def train(
+    parameters: Parameters,
+    pairs: Pairs,
+    key: PRNGKeyArray,
+    *,
+    optimizer: Any,
+    steps: int,
+    batch: int = 8,
+    points: int = 256,
+    noise_bound: float = 0.05,
+    radius: float = 0.04,
+    temperature: float = 0.05,
+    labels: Teach = solver_labels,
+) -> tuple[Parameters, History]:
+    """Train a network on scan pairs; without pose labels unless ``labels=truth_labels``.
+
+    All steps are one ``lax.scan``: the solver, the network and the optimizer compile once.
+
+    Args:
+        parameters: From ``init_network`` (or from a checkpoint).
+        pairs: From ``read_pairs``.
+        key: Decides batches and points.
+        optimizer: An optax optimizer.
+        steps, batch: Steps, and pairs in each.
+        points: Points of each scan that a step looks at, drawn anew each time.
+        noise_bound: Of the teacher [length].
+        radius, temperature: Of ``matching_loss``.
+        labels: Who labels a batch.
+
+    Returns:
+        The trained parameters, and what happened.
+    """
+    count, n = pairs.src.mask.shape
+    points = min(points, n)
+
+    def loss(parameters: Parameters, drawn: Pairs, taught: Labels) -> Array:
+        def one(src: Scan, dst: Scan, pose: Pose) -> Array:
+            return matching_loss(
+                describe(parameters, src), describe(parameters, dst), src.points, dst.points, pose,
+                radius=radius, temperature=temperature,
+            )  # fmt: skip
+
+        return masked_mean(jax.vmap(one)(drawn.src, drawn.dst, taught.pose), taught.trusted)
+
+    def step(state: tuple, key: PRNGKeyArray) -> tuple[tuple, History]:
+        parameters, memory = state
+        which, of_src, of_dst = jax.random.split(key, 3)
+        drawn = jax.tree.map(lambda x: x[jax.random.randint(which, (batch,), 0, count)], pairs)
+        drawn = drawn._replace(
+            src=_thinned(drawn.src, jax.random.permutation(of_src, n)[:points]),
+            dst=_thinned(drawn.dst, jax.random.permutation(of_dst, n)[:points]),
+        )
+        taught = lax.stop_gradient(labels(parameters, drawn, noise_bound))
+        value, slope = jax.value_and_grad(loss)(parameters, drawn, taught)
+        change, memory = optimizer.update(slope, memory, parameters)
+        parameters = jax.tree.map(jnp.add, parameters, change)
+        known = drawn.truth is not None
+        angle = rotation_loss(taught.pose, drawn.truth) if known else jnp.full(batch, jnp.nan)
+        return (parameters, memory), History(value, taught.trusted, angle)
+
+    start = parameters, optimizer.init(parameters)
+    (parameters, _), history = lax.scan(step, start, jax.random.split(key, steps))
+    return parameters, history
+
+
+def _thinned(scan: Scan, rows: Array) -> Scan:
+    return scan._replace(
+        points=scan.points[:, rows], features=scan.features[:, rows], mask=scan.mask[:, rows]
+    )

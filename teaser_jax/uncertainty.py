@@ -1,0 +1,159 @@
+"""How noise in the matches spreads to the pose: covariance and information, by the derivative of ``refit``.
+
+The noise model of a loop closure. Small errors xi of the pose are written about the answer; which ones,
+in which order and in which frame, differs between libraries and is what ``convention`` chooses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from teaser_jax.problem import is_traced
+from teaser_jax.so3 import AnyArray
+from teaser_jax.solve import refit, usable_rows
+from teaser_jax.stages.refinement import squared_residuals
+from teaser_jax.types import Pose, Problem, Solution
+
+Convention = Literal["right", "ros", "gtsam", "g2o"]
+
+
+@partial(
+    jax.tree_util.register_dataclass, data_fields=["covariance", "information"], meta_fields=["convention"]
+)
+@dataclass(frozen=True)
+class Uncertainty:
+    """What ``covariance`` returns. Six coordinates, or seven where the scale is estimated.
+
+    Attributes:
+        covariance: Of the error of the pose; infinite on the diagonal, and zero beside it, where the
+            solution is not ``ok``.
+        information: Its inverse; zero where the solution is not ``ok``, so that in a graph of poses it
+            weighs nothing.
+        convention: Which coordinates, as asked for.
+    """
+
+    covariance: Float[AnyArray, "*batch d d"]
+    information: Float[AnyArray, "*batch d d"]
+    convention: Convention
+
+
+def covariance(
+    problem: Problem, solution: Solution, sigma: Any = None, *, convention: Convention = "right"
+) -> Uncertainty:
+    """Covariance of the pose, to first order in the noise, the chosen matches being right.
+
+    Errors of the targets are taken as independent, with the same deviation in all directions; noise of
+    the source counts as noise of the target, s times as large. The derivative of ``refit`` carries them to
+    the pose, so this is about the estimator as it is: refined or not, weighted or not.
+
+    With R, t, s the answer and R', t', s' the truth, the coordinates are:
+
+    ===========  =========================================================================================
+    convention   coordinates
+    ===========  =========================================================================================
+    ``"right"``  (w, v): R' = R Exp(w), t' = t + R v; rotation first, in the axes of the source frame
+    ``"gtsam"``  the same: the tangent of ``gtsam.Pose3``
+    ``"g2o"``    (v, w / 2): translation first, then the vector part of the quaternion (``EDGE_SE3:QUAT``)
+    ``"ros"``    (R v, R w): translation, then rotation about the fixed axes of the target frame
+                 (``geometry_msgs/PoseWithCovariance``)
+    ===========  =========================================================================================
+
+    Lengths are in the unit of the target and angles in radians. Where the scale is estimated a seventh
+    coordinate follows, log(s' / s); the first six rows and columns are the pose's own covariance.
+
+    Args:
+        problem, solution: A pair that ``solve`` or ``register`` made.
+        sigma: Standard deviation of the error of each coordinate of a match [length], one number or (n,).
+            None: proportional to ``noise_bound``, the factor being estimated from the inliers' residuals.
+        convention: Coordinates, see above.
+
+    Returns:
+        Covariance and information. Pure under jit and vmap; outside, numpy problems give numpy in float64.
+
+    Raises:
+        ValueError: For another convention, or a ``sigma`` of the wrong shape or below 0.
+
+    Gradients: exact, through the second derivative of the fit.
+    """
+    if convention not in get_args(Convention):
+        allowed = ", ".join(repr(x) for x in get_args(Convention))
+        raise ValueError(f"convention is {convention!r}: expected one of {allowed}.")
+    if sigma is not None:
+        sigma = _checked(sigma, problem)
+    if isinstance(problem.src, np.ndarray) and not is_traced(problem, solution, sigma):
+        with jax.enable_x64(True):
+            return jax.device_get(_covariance(problem, solution, sigma, convention))
+    return _covariance(problem, solution, sigma, convention)
+
+
+def _checked(sigma: Any, problem: Problem) -> Any:
+    n = problem.src.shape[:-1]
+    if np.shape(sigma) not in ((), n):
+        raise ValueError(f"sigma has shape {np.shape(sigma)}: expected one number, or one a match, {n}.")
+    if not is_traced(sigma) and not np.all(np.asarray(sigma, float) >= 0):
+        raise ValueError("sigma holds a number below 0, or none at all: expected standard deviations.")
+    return sigma
+
+
+@partial(jax.jit, static_argnames="convention")
+def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Convention) -> Uncertainty:
+    p, _ = usable_rows(problem)
+    pose = jax.tree.map(jnp.asarray, solution.pose)
+    deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)
+    to_first_order = lambda dst: _coordinates(refit(replace(p, dst=dst), solution.selection), pose, p)
+    slope = jax.jacrev(to_first_order)(p.dst)  # (d, n, 3)
+    weighted = slope * jnp.where(p.mask, deviation, 0)[:, None]
+    right = jnp.einsum("ani,bni->ab", weighted, weighted, precision=jax.lax.Precision.HIGHEST)
+    change = _change(pose, len(right), convention)
+    found = change @ right @ change.T
+    eye = jnp.eye(len(found), dtype=found.dtype)
+    known = solution.ok & jnp.all(jnp.isfinite(found))
+    exact = jnp.min(jnp.diagonal(found)) <= 0  # no noise at all
+    # Angles and lengths may be of very different size: invert in units of the deviations.
+    usable = known & ~exact
+    unit = jax.lax.rsqrt(jnp.where(usable, jnp.diagonal(found), 1))
+    inverse = unit[:, None] * jnp.linalg.inv(jnp.where(usable, unit[:, None] * found * unit, eye)) * unit
+    infinite = jnp.where(eye > 0, jnp.inf, 0)
+    return Uncertainty(
+        covariance=jnp.where(known, found, infinite),
+        information=jnp.where(known, jnp.where(exact, infinite, inverse), 0),
+        convention=convention,
+    )
+
+
+def _coordinates(pose: Pose, about: Pose, problem: Problem) -> Float[Array, " d"]:
+    """Small errors of a pose about another, in the axes of the source: turn, shift, log scale if unknown."""
+    between = jnp.einsum("ji,jk->ik", about.rotation, pose.rotation, precision=jax.lax.Precision.HIGHEST)
+    skew = between - between.T
+    turn = 0.5 * jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
+    shift = (pose.translation - about.translation) @ about.rotation
+    scale = [] if problem.scale is not None else [(pose.scale / about.scale - 1)[None]]
+    return jnp.concatenate([turn, shift, *scale])
+
+
+def _change(pose: Pose, d: int, convention: Convention) -> Float[Array, "d d"]:
+    """The matrix from our coordinates to those of a convention."""
+    r, eye, zero = pose.rotation, jnp.eye(3, dtype=pose.rotation.dtype), jnp.zeros_like(pose.rotation)
+    blocks = {
+        "right": [[eye, zero], [zero, eye]],
+        "gtsam": [[eye, zero], [zero, eye]],
+        "g2o": [[zero, eye], [0.5 * eye, zero]],
+        "ros": [[zero, r], [r, zero]],
+    }
+    return jnp.eye(d, dtype=r.dtype).at[:6, :6].set(jnp.block(blocks[convention]))
+
+
+def _estimated(p: Problem, solution: Solution) -> Float[Array, " n"]:
+    """Deviations in proportion to the bounds. Of 3 m residuals the pose has taken six or seven."""
+    r2 = squared_residuals(jax.tree.map(jnp.asarray, solution.pose), p.src, p.dst, p.noise_bound)
+    m = jnp.sum(solution.inliers, dtype=jnp.int32).astype(p.src.dtype)
+    left = 3 * m - (6 if p.scale is not None else 7)
+    total = jnp.sum(jnp.where(solution.inliers, r2, 0))
+    return p.noise_bound * jnp.sqrt(total / jnp.maximum(left, 1))

@@ -1,0 +1,109 @@
+"""Losses against what they stand for, and their gradients where angles and lengths have kinks."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from oracles import random_pose
+
+import teaser_jax as tj
+from teaser_jax import learn
+
+
+def pose(seed: int) -> tj.Pose:
+    return jax.tree.map(jnp.asarray, random_pose(np.random.default_rng(seed)))
+
+
+def test_pose_losses_are_the_errors(x64):
+    a, b = pose(0), pose(1)
+    errors = tj.metrics.errors(a, b)
+    assert learn.rotation_loss(a, b) == pytest.approx(float(errors.rotation), rel=1e-12)
+    assert learn.translation_loss(a, b) == pytest.approx(float(errors.translation), rel=1e-12)
+    points = np.random.default_rng(0).normal(size=(10, 3))
+    mask = np.arange(10) < 7
+    apart = np.linalg.norm(np.asarray(a.apply(points) - b.apply(points)), axis=1)
+    assert learn.point_loss(a, b, points) == pytest.approx(apart.mean())
+    assert learn.point_loss(a, b, points, mask) == pytest.approx(apart[:7].mean())
+
+
+def test_pose_losses_take_batches(x64):
+    stack = lambda *x: jax.tree.map(lambda *y: jnp.stack(y), *x)
+    several, others = stack(pose(0), pose(1)), stack(pose(2), pose(3))
+    points = np.random.default_rng(0).normal(size=(2, 5, 3))
+    for loss in (learn.rotation_loss, learn.translation_loss, lambda a, b: learn.point_loss(a, b, points)):
+        assert loss(several, others).shape == (2,)
+    np.testing.assert_allclose(
+        learn.rotation_loss(several, others)[1], learn.rotation_loss(pose(1), pose(3)), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
+def test_gradients_are_finite_at_every_angle(angle, x64):
+    truth = pose(0)
+    axis = np.array([1.0, 2.0, 2.0]) / 3
+    turn = tj.so3.rotation_from_quat(np.append(np.sin(angle / 2) * axis, np.cos(angle / 2)))
+
+    def loss(rotation):
+        estimate = tj.Pose(rotation, truth.translation, truth.scale)
+        points = jnp.zeros((4, 3)).at[1, 0].set(1.0)
+        total = learn.rotation_loss(estimate, truth) + learn.translation_loss(estimate, truth)
+        return total + learn.point_loss(estimate, truth, points)
+
+    value, slope = jax.value_and_grad(loss)(truth.rotation @ turn)
+    assert np.isfinite(value)
+    assert np.all(np.isfinite(slope))
+
+
+def test_inlier_loss_is_balanced_cross_entropy(x64):
+    rng = np.random.default_rng(0)
+    logits, inliers, mask = rng.normal(size=(3, 20)), rng.random((3, 20)) < 0.2, rng.random((3, 20)) < 0.8
+    each = np.asarray(optax.sigmoid_binary_cross_entropy(logits, inliers.astype(float)))
+    expected = 0.5 * (each[mask & inliers].mean() + each[mask & ~inliers].mean())
+    assert learn.inlier_loss(logits, inliers, mask) == pytest.approx(expected)
+    # More wrong matches of the same kind change nothing.
+    wrong = np.concatenate([logits, logits[:, ~inliers.any(axis=0)]], axis=1)
+    assert np.isfinite(learn.inlier_loss(wrong, np.zeros(wrong.shape, bool)))
+
+
+def test_keypoint_loss_saturates_and_draws_keypoints_together(x64):
+    truth, src = pose(4), np.random.default_rng(0).normal(size=(8, 3))
+    dst = np.array(truth.apply(src))
+    assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1) < 1e-20
+    dst[0] += 1e6
+    assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1) == pytest.approx(1 / 8)
+    assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1, mask=np.arange(8) > 0) < 1e-20
+    off = src + 0.05
+    loss = lambda src: learn.keypoint_loss(src, dst, truth, noise_bound=0.1)
+    assert loss(off - 0.01 * jax.grad(loss)(jnp.asarray(off))) < loss(off)
+
+
+def test_matching_loss_by_hand(x64):
+    rng = np.random.default_rng(0)
+    src = rng.uniform(size=(6, 3))
+    truth = pose(5)
+    dst = np.concatenate([np.asarray(truth.apply(src[:4])), rng.uniform(5, 6, (3, 3))])
+    a, b = rng.normal(size=(6, 4)), rng.normal(size=(7, 4))
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
+    found = learn.matching_loss(a, b, src, dst, truth, radius=1e-3, temperature=0.5)
+    weight = np.exp(a @ b.T / 0.5)
+    rows = np.mean([-np.log(weight[i, i] / weight[i].sum()) for i in range(4)])
+    columns = np.mean([-np.log(weight[i, i] / weight[:, i].sum()) for i in range(4)])
+    assert found == pytest.approx(0.5 * (rows + columns))
+
+
+def test_nothing_to_learn_from_is_zero_with_gradient_zero():
+    truth, nothing = pose(6), jnp.zeros(5, bool)
+    src, a = jnp.zeros((5, 3)), jnp.ones((5, 4))
+    losses = [
+        lambda a: learn.matching_loss(a, a, src, src + 9, truth, radius=0.1),
+        lambda a: learn.inlier_loss(a[:, 0], nothing, nothing),
+        lambda a: learn.keypoint_loss(a[:, :3], src, truth, noise_bound=0.1, mask=nothing),
+        lambda a: learn.point_loss(truth, pose(7), a[:, :3], nothing),
+    ]
+    for loss in losses:
+        value, slope = jax.value_and_grad(loss)(a)
+        assert value == 0
+        np.testing.assert_array_equal(slope, 0)

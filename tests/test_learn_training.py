@@ -1,0 +1,118 @@
+"""The network sees shapes and not frames, and the loop teaches it something without pose labels."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from oracles import random_pose
+
+from teaser_jax import learn, synthetic
+from teaser_jax.learn.network import _normals
+
+SIZE = 320
+
+
+@pytest.fixture(scope="module")
+def pairs() -> learn.Pairs:
+    models = [synthetic.random_solid((0, k), n=4000) for k in range(4)]
+    return learn.read_pairs(
+        synthetic.scan_pair((1, k), models[k % 4], n=SIZE, turn=(5, 15), sigma=0.002) for k in range(12)
+    )
+
+
+def scan_of(points, viewpoint, **known) -> learn.Scan:
+    return learn.read_scan(jnp.asarray(points, jnp.float32), jnp.asarray(viewpoint, jnp.float32), **known)
+
+
+def test_descriptors_are_the_same_in_every_frame():
+    pair = synthetic.scan_pair(0, synthetic.teapot(20_000), n=SIZE, sigma=0.0)
+    network = learn.init_network(jax.random.key(0))
+    here = learn.describe(network, scan_of(pair.src, pair.src_viewpoint))
+    pose = random_pose(np.random.default_rng(0))
+    moved = scan_of(pose.apply(pair.src), pose.apply(pair.src_viewpoint[None])[0])
+    there = learn.describe(network, moved)
+    np.testing.assert_allclose(np.linalg.norm(here, axis=1), 1, atol=1e-5)
+    # A neighbour at the very edge of a ring, or a normal at right angles to the view, may fall either way.
+    assert np.median(np.sum(here * there, axis=1)) > 0.995
+    order = np.random.default_rng(0).permutation(SIZE)
+    shuffled = learn.describe(network, scan_of(pair.src[order], pair.src_viewpoint))
+    assert np.median(np.sum(here[order] * shuffled, axis=1)) > 0.9999
+
+
+def test_normals_of_a_ball_point_outwards():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(800, 3))
+    ball = 0.5 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    seen, radius = ball[ball[:, 2] > 0.1], 0.12
+    near = np.linalg.norm(seen[:, None] - seen, axis=2) < radius
+    sensor = jnp.asarray([0.0, 0, 10])
+    normals = _normals(jnp.asarray(seen), sensor, jnp.ones(len(seen), bool), jnp.asarray(near), radius)
+    assert np.mean(np.sum(normals * 2 * seen, axis=1)) > 0.98
+    alone = _normals(jnp.asarray(seen), sensor, jnp.ones(len(seen), bool), jnp.zeros_like(near), radius)
+    assert np.min(alone[:, 2]) > 0.99  # nobody near: towards the sensor
+
+
+def test_padding_changes_nothing():
+    network = learn.init_network(jax.random.key(0))
+    pair = synthetic.scan_pair(0, synthetic.teapot(20_000), n=SIZE)
+    plain = learn.describe(network, scan_of(pair.src, pair.src_viewpoint))
+    padded = np.concatenate([pair.src, np.full((20, 3), 0.1)])
+    found = learn.describe(network, scan_of(padded, pair.src_viewpoint, mask=jnp.arange(SIZE + 20) < SIZE))
+    assert np.median(np.sum(found[:SIZE] * plain, axis=1)) > 0.9999
+
+
+@partial(jax.jit, static_argnames=("labels", "steps"))
+def trained(network, pairs, key, *, labels=learn.solver_labels, steps=60):
+    return learn.train(
+        network,
+        pairs,
+        key,
+        optimizer=OPTIMIZER,
+        steps=steps,
+        batch=4,
+        points=224,
+        noise_bound=0.06,
+        labels=labels,
+    )
+
+
+OPTIMIZER = optax.adam(3e-3)
+
+
+def test_training_lowers_the_loss_and_uses_no_true_pose(pairs):
+    network = learn.init_network(jax.random.key(0))
+    after, history = trained(network, pairs, jax.random.key(1))
+    assert history.loss.shape == (60,)
+    assert history.trusted.shape == history.angle.shape == (60, 4)
+    trusting = np.any(history.trusted, axis=1)
+    loss = np.asarray(history.loss)[trusting]
+    assert np.mean(loss[-15:]) < 0.8 * np.mean(loss[:15])
+    assert np.mean(np.degrees(history.angle)[history.trusted] < 15) > 0.7
+    # Training on the solver's labels does not look at the true ones.
+    blind, _ = trained(network, pairs._replace(truth=None), jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, blind, after)
+    supervised, told = trained(network, pairs, jax.random.key(1), labels=learn.truth_labels)
+    assert np.all(told.trusted)
+    np.testing.assert_allclose(told.angle, 0, atol=1e-3)
+    assert jax.tree.structure(supervised) == jax.tree.structure(network)
+
+
+def test_pairs_that_nobody_trusts_teach_nothing(pairs):
+    def distrust(network, pairs, noise_bound):
+        labels = learn.truth_labels(network, pairs, noise_bound)
+        return learn.Labels(labels.pose, labels.inliers, jnp.zeros_like(labels.trusted), labels.status)
+
+    network = learn.init_network(jax.random.key(0))
+    after, history = trained(network, pairs, jax.random.key(1), labels=distrust, steps=3)
+    np.testing.assert_array_equal(history.loss, 0)
+    jax.tree.map(np.testing.assert_array_equal, after, network)
+
+
+def test_no_pairs_are_refused():
+    with pytest.raises(ValueError, match="no pair"):
+        learn.read_pairs([])

@@ -1,0 +1,199 @@
+"""The softened problem: a fixed point, its derivative three ways, and what becomes of hopeless input."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+from oracles import assert_finite, problem_of, random_matches, solve
+
+import teaser_jax as tj
+from teaser_jax.stages.gnc import gnc_cost, gnc_weights
+from teaser_jax.stages.refinement import fit_similarity, squared_residuals
+
+N = 32
+soften = jax.jit(lambda problem, gnc_mu: tj.soft_solve(problem, gnc_mu=gnc_mu))
+
+
+def blurred(seed: int, *, scale=None) -> tj.Problem:
+    """A problem in which residuals of right matches spread over the threshold."""
+    rng = np.random.default_rng(seed)
+    matches = random_matches(seed, N, wrong=0.4, scale=1.3)
+    problem = problem_of(matches, scale=scale, confidence=rng.uniform(0.5, 1, N))
+    return replace(problem, dst=problem.dst + 0.04 * rng.normal(size=(N, 3)))
+
+
+def moved(problem: tj.Problem, gnc_mu: float, name: str, step) -> tuple[tj.Problem, float]:
+    if name == "gnc_mu":
+        return problem, gnc_mu + step
+    return replace(problem, **{name: getattr(problem, name) + step}), gnc_mu
+
+
+@jax.jit
+def both_ways(problem, gnc_mu, direction, cotangent):
+    """Derivatives of pose and weights along a direction, and the gradient of their combination."""
+    names = [name for name in direction if name != "gnc_mu"]
+
+    def run(inputs):
+        known = {name: inputs[name] for name in names}
+        found = tj.soft_solve(replace(problem, **known), gnc_mu=inputs["gnc_mu"])
+        return found.pose.matrix, found.weights
+
+    inputs = {**{name: getattr(problem, name) for name in names}, "gnc_mu": gnc_mu}
+    _, along = jax.linearize(run, inputs)  # one program for both: most of a test's time is XLA's
+    return along(direction), jax.linear_transpose(along, inputs)(cotangent)[0]
+
+
+@pytest.mark.parametrize("scale", [1.3, None], ids=["known", "unknown"])
+def test_forward_reverse_and_central_differences_agree(scale, x64):
+    rng = np.random.default_rng(0)
+    problem, mu = blurred(11, scale=scale), 1.0
+    found = soften(problem, mu)
+    assert found.ok
+    assert np.sum((found.weights > 0.01) & (found.weights < 0.99)) >= 3
+    names = ["src", "dst", "noise_bound", "confidence", "cbar2"] + ["scale"] * (scale is not None)
+    inputs = {**{name: getattr(problem, name) for name in names}, "gnc_mu": jnp.asarray(mu)}
+    cotangent = rng.normal(size=(4, 4)), rng.normal(size=N)
+    for name, value in inputs.items():
+        direction = {key: jnp.zeros_like(x) for key, x in inputs.items()}
+        direction[name] = rng.normal(size=np.shape(value)) * (0.1 if name == "noise_bound" else 1)
+        forward, gradient = both_ways(problem, mu, direction, cotangent)
+        ahead, behind = (soften(*moved(problem, mu, name, sign * 1e-6 * direction[name])) for sign in (1, -1))
+        central = [
+            (a - b) / 2e-6
+            for a, b in ((ahead.pose.matrix, behind.pose.matrix), (ahead.weights, behind.weights))
+        ]
+        for mine, theirs in zip(forward, central, strict=True):
+            size = max(1.0, float(np.max(np.abs(theirs))))
+            np.testing.assert_allclose(mine, theirs, atol=1e-6 * size, err_msg=name)
+        combined = sum(np.sum(c * f) for c, f in zip(cotangent, forward, strict=True))
+        np.testing.assert_allclose(np.sum(gradient[name] * direction[name]), combined, rtol=1e-9, atol=1e-9)
+
+
+def test_unrolling_the_iteration_gives_the_same_gradient(x64):
+    problem = blurred(12, scale=1.3)
+    start = soften(problem, 1.0).pose
+    cotangent = np.random.default_rng(0).normal(size=(4, 4))
+
+    def unrolled(dst):
+        def step(_, pose):
+            r2 = squared_residuals(pose, problem.src, dst, problem.noise_bound)
+            w = problem.confidence / problem.noise_bound**2 * gnc_weights(r2, 1.0, problem.cbar2)
+            return fit_similarity(problem.src, dst, w, problem.scale).pose
+
+        return jnp.sum(cotangent * lax.fori_loop(0, 60, step, start).matrix)
+
+    implicit = jax.jit(jax.grad(lambda dst: jnp.sum(cotangent * _pose(replace(problem, dst=dst)).matrix)))
+    np.testing.assert_allclose(implicit(problem.dst), jax.jit(jax.grad(unrolled))(problem.dst), atol=1e-8)
+
+
+def _pose(problem: tj.Problem) -> tj.Pose:
+    return tj.soft_solve(problem).pose
+
+
+def test_matches_near_the_threshold_have_a_gradient_that_solve_lacks(x64):
+    problem = blurred(11, scale=1.3)
+    found = soften(problem, 1.0)
+    half = (found.weights > 0.05) & (found.weights < 0.95)
+    out = half & ~found.solution.inliers
+    assert out.any()
+
+    def slope(pose_of):
+        total = lambda dst: jnp.sum(pose_of(replace(problem, dst=dst)).matrix)
+        return np.linalg.norm(jax.jit(jax.grad(total))(problem.dst), axis=1)
+
+    assert np.all(slope(_pose)[out] > 1e-6)
+    np.testing.assert_array_equal(slope(lambda p: tj.solve(p).pose)[out], 0)
+
+
+def test_a_stiff_control_gives_the_answer_of_solve(x64):
+    problem = problem_of(random_matches(13, N, wrong=0.4), scale=None)
+    stiff = soften(problem, 1e6)
+    np.testing.assert_allclose(stiff.pose.matrix, solve(problem).pose.matrix, atol=1e-9)
+    np.testing.assert_allclose(stiff.weights, stiff.solution.inliers, atol=1e-6)
+    assert stiff.cost == pytest.approx(float(stiff.solution.cost), rel=1e-6)
+
+
+def test_the_cost_is_stationary_and_least(x64):
+    problem = blurred(14, scale=None)
+    found = soften(problem, 1.0)
+
+    def cost(pose):
+        r2 = squared_residuals(pose, problem.src, problem.dst, problem.noise_bound)
+        return float(jnp.sum(problem.confidence * gnc_cost(r2, 1.0, problem.cbar2)))
+
+    rng = np.random.default_rng(0)
+    assert cost(found.pose) == pytest.approx(float(found.cost))
+    for _ in range(20):
+        turn = tj.so3.rotation_from_quat(np.append(1e-3 * rng.normal(size=3), 1.0))
+        shift, scale = found.pose.translation + 1e-3 * rng.normal(size=3), found.pose.scale * 1.0005
+        assert cost(tj.Pose(found.pose.rotation @ turn, shift, scale)) > found.cost
+
+
+def test_weights_are_the_slope_of_the_cost(x64):
+    r2 = np.linspace(0, 4, 1001)
+    for mu in (0.1, 1.0, 30.0):
+        slope = jax.vmap(jax.grad(gnc_cost), (0, None, None))(r2, mu, 1.0)
+        kinks = np.minimum(np.abs(r2 - mu / (mu + 1)), np.abs(r2 - (mu + 1) / mu)) < 1e-9
+        np.testing.assert_allclose(slope[~kinks], gnc_weights(r2, mu, 1.0)[~kinks], atol=1e-9)
+        assert np.all(np.isfinite(jax.vmap(jax.grad(gnc_weights), (0, None, None))(r2, mu, 1.0)))
+
+
+def test_hopeless_items_are_finite_say_so_and_spoil_none(x64):
+    good = blurred(15, scale=None)
+    line = np.zeros((N, 3))
+    line[:, 0] = np.linspace(0, 1, N)
+    hopeless = [
+        replace(good, src=jnp.full((N, 3), jnp.nan)),
+        replace(good, mask=jnp.zeros(N, bool)),
+        replace(good, src=jnp.asarray(line), dst=jnp.asarray(line)),
+        replace(good, src=jnp.zeros((N, 3)), dst=jnp.zeros((N, 3))),
+        problem_of(random_matches(14, N, wrong=1.0), scale=None),
+    ]
+    total = lambda src, problem: jnp.sum(tj.soft_solve(replace(problem, src=src)).pose.matrix)
+    gradient = jax.jit(jax.vmap(jax.grad(total)))
+    solved = jax.jit(jax.vmap(tj.soft_solve))
+    slopes = []
+    for others in ([good] * len(hopeless), hopeless):
+        batch = tj.stack_problems([good, *others])
+        found = solved(batch)
+        assert_finite(found)
+        slopes.append(np.asarray(gradient(batch.src, batch)))
+        assert np.all(np.isfinite(slopes[-1]))
+    np.testing.assert_array_equal(slopes[1][0], slopes[0][0])
+    assert not np.any(found.ok[1:])
+    np.testing.assert_array_equal(slopes[1][1:5], 0)
+
+
+@pytest.mark.parametrize("mu", [0.0, -1.0, np.nan, np.inf])
+def test_a_control_that_makes_no_sense_is_no_success(mu, x64):
+    found = soften(blurred(11), mu)
+    assert_finite(found)
+    assert found.status == tj.Status.NOT_CONVERGED
+
+
+def test_single_precision_follows_double():
+    problem = blurred(11, scale=1.3)
+    with jax.enable_x64(True):
+        wide = blurred(11, scale=1.3)
+        exact = jax.jit(jax.grad(lambda dst: jnp.sum(_pose(replace(wide, dst=dst)).matrix)))(wide.dst)
+    found = jax.jit(jax.grad(lambda dst: jnp.sum(_pose(replace(problem, dst=dst)).matrix)))(problem.dst)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, exact, atol=1e-3 * np.max(np.abs(exact)))
+    assert soften(problem, 1.0).ok
+
+
+def test_memory_does_not_grow_with_the_iterations():
+    problem = blurred(11, scale=1.3)
+
+    def temporaries(iterations):
+        total = lambda dst: jnp.sum(
+            tj.soft_solve(replace(problem, dst=dst), iterations=iterations).pose.matrix
+        )
+        return jax.jit(jax.grad(total)).lower(problem.dst).compile().memory_analysis().temp_size_in_bytes
+
+    assert temporaries(500) == temporaries(5)

@@ -1,0 +1,123 @@
+"""The covariance of a pose: against Monte Carlo, between conventions, and where there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import problem_of, random_matches
+from scipy.stats import chi2
+
+import teaser_jax as tj
+
+N, RUNS, SIGMA = 40, 300, 0.01
+GREEDY = tj.Settings(clique="greedy")
+CONVENTIONS = ("right", "gtsam", "g2o", "ros")
+
+
+def error_between(answer: tj.Pose, truth: tj.Pose, convention: str, unknown: bool) -> jax.Array:
+    """The coordinates as the docstring defines them, with the logarithm of the rotation in full."""
+    between = answer.rotation.T @ truth.rotation
+    skew = jnp.stack(
+        [between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]]
+    )
+    sine = jnp.linalg.norm(skew) / 2
+    w = skew / 2 * jnp.arctan2(sine, (jnp.trace(between) - 1) / 2) / sine
+    shift = truth.translation - answer.translation
+    v = answer.rotation.T @ shift
+    found = {
+        "right": (w, v), "gtsam": (w, v), "g2o": (v, w / 2), "ros": (shift, answer.rotation @ w)
+    }[convention]  # fmt: skip
+    last = [jnp.log(truth.scale / answer.scale)[None]] if unknown else []
+    return jnp.concatenate([*found, *last])
+
+
+@pytest.mark.parametrize(
+    ("scale", "refine"), [(1.5, True), (None, True), (1.5, False)], ids=["known", "unknown", "cascade"]
+)
+def test_errors_are_as_large_as_the_covariance_says(scale, refine, x64):
+    # Normalised errors squared follow chi^2: their mean over the runs must lie within its 95 % band. The
+    # noise differs from match to match, and the weights are not the best ones.
+    matches = random_matches(3, N, wrong=0.3, noise=0.0, scale=1.5)
+    rng = np.random.default_rng(0)
+    sigma = SIGMA * rng.uniform(0.3, 1, N)
+    base = problem_of(matches, scale=scale, confidence=rng.uniform(0.5, 1, N))
+    settings = replace(GREEDY, refine=refine)
+
+    def run(key):
+        noise = sigma[:, None] * jax.random.normal(key, (N, 3)) * matches.inliers[:, None]
+        problem = replace(base, dst=base.dst + noise)
+        solution = tj.solve(problem, settings)
+        squares = []
+        for convention in CONVENTIONS:
+            found = tj.covariance(problem, solution, sigma, convention=convention)
+            error = error_between(solution.pose, matches.truth, convention, scale is None)
+            squares.append(error @ found.information @ error)
+        return jnp.stack(squares), solution.ok
+
+    squares, ok = jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), RUNS))
+    assert np.all(ok)
+    d = 6 if scale else 7
+    low, high = chi2.ppf([0.025, 0.975], d * RUNS) / RUNS
+    for mean in np.mean(squares, axis=0):
+        assert low < mean < high
+    np.testing.assert_allclose(squares[:, 1:], squares[:, :1], rtol=0.05)
+
+
+def test_covariance_and_information_are_inverse_and_symmetric(x64):
+    problem = problem_of(random_matches(4, N, wrong=0.3), scale=None)
+    solution = jax.jit(tj.solve)(problem)
+    for convention in CONVENTIONS:
+        found = tj.covariance(problem, solution, SIGMA, convention=convention)
+        assert found.convention == convention
+        np.testing.assert_allclose(found.covariance @ found.information, np.eye(7), atol=1e-8)
+        np.testing.assert_allclose(found.covariance, found.covariance.T, atol=1e-18)
+        np.testing.assert_array_less(0, np.linalg.eigvalsh(found.covariance))
+
+
+def test_least_squares_has_the_covariance_of_its_normal_equations(x64):
+    matches = random_matches(5, N, wrong=0.0, noise=0.1)
+    problem = problem_of(matches)
+    found = tj.covariance(problem, jax.jit(tj.solve)(problem), SIGMA)
+    rotation = np.asarray(jax.jit(tj.solve)(problem).pose.rotation)
+    rows = [np.hstack([-rotation @ np.asarray(tj.so3.hat(a)), rotation]) for a in matches.src]
+    information = sum(row.T @ row for row in rows) / SIGMA**2
+    np.testing.assert_allclose(found.information, information, rtol=0.02, atol=1e-3 * information.max())
+
+
+def test_the_deviation_can_be_estimated():
+    matches = random_matches(6, 400, wrong=0.2, noise=0.0, noise_bound=0.06)
+    rng = np.random.default_rng(0)
+    dst = matches.dst + SIGMA * rng.normal(size=(400, 3))
+    result = tj.register(matches.src, dst, noise_bound=0.06)
+    told = tj.covariance(result.problem, result.solution, SIGMA)
+    guessed = tj.covariance(result.problem, result.solution)
+    assert told.covariance.dtype == np.float64  # register's problems are numpy in float64
+    np.testing.assert_allclose(guessed.covariance, told.covariance, rtol=0.1)
+
+
+def test_an_answer_that_failed_knows_nothing(x64):
+    problem = problem_of(random_matches(14, N, wrong=1.0))
+    found = tj.covariance(problem, jax.jit(tj.solve)(problem), SIGMA)
+    np.testing.assert_array_equal(found.information, 0)
+    assert np.all(np.isinf(np.diag(found.covariance)))
+
+
+def test_no_noise_is_exact(x64):
+    problem = problem_of(random_matches(7, N, wrong=0.3))
+    found = tj.covariance(problem, jax.jit(tj.solve)(problem), 0.0)
+    np.testing.assert_array_equal(found.covariance, 0)
+    assert np.all(np.isinf(np.diag(found.information)))
+
+
+def test_bad_arguments_are_told_apart():
+    matches = random_matches(8, N)
+    result = tj.register(matches.src, matches.dst, noise_bound=0.05)
+    for sigma, words in ((-1.0, "below 0"), (np.nan, "below 0"), (np.ones(3), "shape")):
+        with pytest.raises(ValueError, match=words):
+            tj.covariance(result.problem, result.solution, sigma)
+    with pytest.raises(ValueError, match="expected one of 'right', 'ros'"):
+        tj.covariance(result.problem, result.solution, SIGMA, convention="left")
