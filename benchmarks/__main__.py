@@ -7,7 +7,19 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks import accuracy, baseline, certificate, clique, cold, growth, learning, speed, stream, trust
+from benchmarks import (
+    accuracy,
+    baseline,
+    certificate,
+    clique,
+    cold,
+    gradients,
+    growth,
+    learning,
+    speed,
+    stream,
+    trust,
+)
 
 HERE = Path(__file__).parent
 BENCHMARKS = {
@@ -19,6 +31,7 @@ BENCHMARKS = {
     "cold": cold,
     "growth": growth,
     "certificate": certificate,
+    "gradients": gradients,
     "learning": learning,
 }
 

@@ -12,7 +12,7 @@ from teaser_jax.register import Registration, register, warmup
 from teaser_jax.soft import SoftSolution, soft_solve
 from teaser_jax.solve import refit, select, solve
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
-from teaser_jax.uncertainty import Uncertainty, covariance
+from teaser_jax.uncertainty import Uncertainty, covariance, pose_difference
 from teaser_jax.wahba import RotationSolution, solve_rotation
 
 __version__ = "0.1.0"
@@ -21,6 +21,6 @@ __all__ = [
     "Certificate", "CertificateStatus", "CertifiedBy", "ErrorBounds", "Pose", "Problem", "Profile",
     "Registration", "RotationSolution", "Selection", "Settings", "SoftSolution", "Solution", "Status",
     "Uncertainty", "certify", "certify_rotation", "covariance", "error_bounds", "files", "learn",
-    "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "so3", "soft_solve",
-    "solve", "solve_rotation", "stack_problems", "synthetic", "verify", "warmup",
+    "make_problem", "metrics", "plots", "pose_difference", "profile", "refit", "register", "select", "so3",
+    "soft_solve", "solve", "solve_rotation", "stack_problems", "synthetic", "verify", "warmup",
 ]  # fmt: skip

@@ -121,7 +121,10 @@ def soft_solve(
 def _stationary(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Array, ""], Bool[Array, ""]]:
     """The pose, whether the fits settled on it, and whether the cost curves upwards there on all sides."""
     pose, settled = _descend(data, start, iterations)
-    return pose, settled, _curvature(data, pose).determined
+    curvature = _curvature(data, pose)
+    slope = jax.grad(_energy)(jnp.zeros_like(curvature.unit), data, pose)
+    step = jnp.where(settled, -_solved(curvature, slope), 0)
+    return _moved(pose, step, data), settled, curvature.determined
 
 
 def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Array, ""]]:
@@ -131,10 +134,12 @@ def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Arra
         settled: Array
         rounds: Array
 
-    # What rounding of the coordinates does to a weight: (1 + mu) times what it does to a residual.
+    # Fits converge linearly, and one step of Newton's method after them squares what is left. But no
+    # further than rounding allows: it changes a weight by (1 + mu) times what it changes a residual.
+    eps = jnp.finfo(data.src.dtype).eps
     largest = jnp.maximum(jnp.abs(data.src), jnp.abs(data.dst))
     reach = jnp.max(largest / data.noise_bound[:, None], initial=1)
-    smallest_change = 16 * jnp.finfo(data.src.dtype).eps * (1 + data.gnc_mu) * reach
+    smallest_change = jnp.maximum(2 * eps**0.5, 16 * eps * (1 + data.gnc_mu) * reach)
 
     def weigh(pose: Pose) -> Array:
         r2 = squared_residuals(pose, data.src, data.dst, data.noise_bound)
@@ -199,6 +204,22 @@ def _curvature(data: _Data, pose: Pose) -> _Curvature:
     return _Curvature(jnp.where(determined, matrix, jnp.eye(d, dtype=dtype)), unit, determined)
 
 
+def _solved(curvature: _Curvature, slope: Float[Array, " d"]) -> Float[Array, " d"]:
+    """The step to which a slope belongs; none where the cost does not determine it."""
+    scaled = jnp.where(curvature.determined, slope, 0) * curvature.unit
+    return curvature.unit * jnp.linalg.solve(curvature.matrix, scaled)
+
+
+def _moved(pose: Pose, step: Float[Array, " d"], data: _Data) -> Pose:
+    """The pose after a small step about the middle."""
+    half_turn = jnp.concatenate([0.5 * step[:3], jnp.ones_like(step[:1])])
+    rotation = pose.rotation @ so3.rotation_from_quat(half_turn)
+    scale = pose.scale if data.scale is not None else pose.scale * jnp.exp(step[6])
+    middle = _middle(data)[None]
+    place = pose.scale * so3.rotate(pose.rotation, middle) - scale * so3.rotate(rotation, middle)
+    return Pose(rotation, pose.translation + step[3:6] + place[0], scale)
+
+
 @_stationary.defjvp
 def _stationary_jvp(iterations: int, primals: tuple, tangents: tuple) -> tuple[Any, Any]:
     # The slope of the cost is zero at the pose, whatever the data: J dx + dG = 0.
@@ -208,8 +229,7 @@ def _stationary_jvp(iterations: int, primals: tuple, tangents: tuple) -> tuple[A
     zero = jnp.zeros_like(curvature.unit)
     slope = lambda data: jax.grad(_energy)(zero, data, pose)
     _, d_slope = jax.jvp(slope, (data,), (d_data,))
-    d_slope = jnp.where(curvature.determined, d_slope, 0) * curvature.unit
-    step = -curvature.unit * jnp.linalg.solve(curvature.matrix, d_slope)
+    step = -_solved(curvature, d_slope)
     # The step is one about the middle; the pose is about the origin.
     d_rotation = pose.rotation @ so3.hat(step[:3])
     if data.scale is None:

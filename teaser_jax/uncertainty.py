@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.solve import refit, usable_rows
+from teaser_jax.stages.invariants import safe_norm
 from teaser_jax.stages.refinement import squared_residuals
 from teaser_jax.types import Pose, Problem, Solution
 
@@ -82,15 +83,54 @@ def covariance(
 
     Gradients: exact, through the second derivative of the fit.
     """
-    if convention not in get_args(Convention):
-        allowed = ", ".join(repr(x) for x in get_args(Convention))
-        raise ValueError(f"convention is {convention!r}: expected one of {allowed}.")
+    _check_convention(convention)
     if sigma is not None:
         sigma = _checked(sigma, problem)
     if isinstance(problem.src, np.ndarray) and not is_traced(problem, solution, sigma):
         with jax.enable_x64(True):
             return jax.device_get(_covariance(problem, solution, sigma, convention))
     return _covariance(problem, solution, sigma, convention)
+
+
+def pose_difference(
+    pose: Pose, truth: Pose, *, convention: Convention = "right", with_scale: bool = False
+) -> Float[Array, " d"]:
+    """The error of a pose in the coordinates of ``covariance``, with the rotation's logarithm in full.
+
+    ``error @ information @ error`` is the normalised error squared, which should follow chi^2.
+
+    Args:
+        pose, truth: The answer, and what it should be.
+        convention: As for ``covariance``.
+        with_scale: Append log(s' / s).
+
+    Raises:
+        ValueError: For another convention.
+
+    Gradients: exact, but zero where the rotations are equal or opposite.
+    """
+    _check_convention(convention)
+    pose, truth = (jax.tree.map(jnp.asarray, x) for x in (pose, truth))
+    between = jnp.einsum("ji,jk->ik", pose.rotation, truth.rotation, precision=jax.lax.Precision.HIGHEST)
+    axis = 0.5 * _axial(between)
+    sine = safe_norm(axis)
+    angle = jnp.arctan2(sine, 0.5 * (jnp.trace(between) - 1))
+    turn = axis * jnp.where(sine > 0, angle / jnp.where(sine > 0, sine, 1), 1)
+    shift = (truth.translation - pose.translation) @ pose.rotation
+    scale = [jnp.log(truth.scale / pose.scale)[None]] if with_scale else []
+    right = jnp.concatenate([turn, shift, *scale])
+    return _change(pose, len(right), convention) @ right
+
+
+def _axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    skew = matrix - matrix.T
+    return jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
+
+
+def _check_convention(convention: Any) -> None:
+    if convention not in get_args(Convention):
+        allowed = ", ".join(repr(x) for x in get_args(Convention))
+        raise ValueError(f"convention is {convention!r}: expected one of {allowed}.")
 
 
 def _checked(sigma: Any, problem: Problem) -> Any:
@@ -131,8 +171,7 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
 def _coordinates(pose: Pose, about: Pose, problem: Problem) -> Float[Array, " d"]:
     """Small errors of a pose about another, in the axes of the source: turn, shift, log scale if unknown."""
     between = jnp.einsum("ji,jk->ik", about.rotation, pose.rotation, precision=jax.lax.Precision.HIGHEST)
-    skew = between - between.T
-    turn = 0.5 * jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
+    turn = 0.5 * _axial(between)
     shift = (pose.translation - about.translation) @ about.rotation
     scale = [] if problem.scale is not None else [(pose.scale / about.scale - 1)[None]]
     return jnp.concatenate([turn, shift, *scale])

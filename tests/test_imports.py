@@ -28,7 +28,7 @@ ORDER = [
     "packing", "summary", "register", "profile",
     "metrics", "synthetic.models", "synthetic.protocol", "synthetic.solids", "synthetic.scans",
     "learn.matching", "learn.losses", "learn.teacher", "learn.network", "learn.training",
-    "files", "plots.stages", "plots.proofs", "cli",
+    "files", "plots.stages", "plots.proofs", "plots.learning", "cli",
 ]  # fmt: skip
 # The search returns to the module that calls it for one thing: networkx, where numba cannot be had. The
 # summary names the type of what it is about, for type checkers only.

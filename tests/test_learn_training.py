@@ -116,3 +116,14 @@ def test_pairs_that_nobody_trusts_teach_nothing(pairs):
 def test_no_pairs_are_refused():
     with pytest.raises(ValueError, match="no pair"):
         learn.read_pairs([])
+
+
+def test_a_checkpoint_is_the_leaves_of_a_tree(pairs, tmp_path):
+    network, history = trained(learn.init_network(jax.random.key(0)), pairs, jax.random.key(1))
+    labels = learn.truth_labels(network, pairs, 0.06)
+    for thing in (network, history, labels, pairs):
+        leaves, shape = jax.tree.flatten(thing)
+        np.savez(tmp_path / "checkpoint.npz", *leaves)
+        with np.load(tmp_path / "checkpoint.npz") as stored:
+            again = jax.tree.unflatten(shape, [stored[f"arr_{k}"] for k in range(len(leaves))])
+        jax.tree.map(np.testing.assert_array_equal, again, thing)

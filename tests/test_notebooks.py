@@ -16,21 +16,30 @@ import teaser_jax
 
 FOLDER = Path(__file__).parents[1] / "notebooks"
 NOTEBOOKS = [
-    FOLDER / f"{name}.ipynb" for name in ("01_quickstart", "02_inside_the_method", "03_certificates")
+    FOLDER / f"{name}.ipynb"
+    for name in (
+        "01_quickstart",
+        "02_inside_the_method",
+        "03_certificates",
+        "04_learning_through_registration",
+    )
 ]
 
 
-# The one on certificates registers a thousand problems.
-LONG = [pytest.param(p, marks=pytest.mark.slow) if p.stem.startswith("03") else p for p in NOTEBOOKS]
+# The one on certificates registers a thousand problems, the one on learning trains three networks.
+SLOW = ("03_certificates", "04_learning_through_registration")
+LONG = [pytest.param(p, marks=pytest.mark.slow) if p.stem in SLOW else p for p in NOTEBOOKS]
 
 
 @pytest.mark.parametrize("path", LONG, ids=lambda path: path.stem)
 def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in surroundings(tmp_path).items():
         monkeypatch.setenv(name, value)
+    if path.stem in SLOW:
+        monkeypatch.delenv("JAX_DISABLE_MOST_OPTIMIZATIONS")  # runs longer than it compiles
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(
-        notebook, kernel_name="python3", timeout=300, resources={"metadata": {"path": str(tmp_path)}}
+        notebook, kernel_name="python3", timeout=600, resources={"metadata": {"path": str(tmp_path)}}
     )
     client.execute()
     counts = [cell.execution_count for cell in notebook.cells if cell.cell_type == "code"]

@@ -124,3 +124,23 @@ def test_certified_answers_and_error_bounds():
     true, bounds = np.array([0.1, 0.2, 0.0]), np.array([1.0, 3.0, np.inf])
     drawn(plots.plot_bounds({"whole set": (true, bounds), "paper": (true, 10 * bounds)}))
     drawn(plots.plot_bounds({}))
+
+
+def test_slopes_errors_and_training_are_drawn():
+    rng = np.random.default_rng(0)
+    residuals = rng.uniform(0, 3, 40)
+    figure = plots.plot_slopes(residuals, residuals * 0, residuals, np.clip(1.5 - residuals, 0, 1))
+    assert len(figure.axes) == 2
+    drawn(figure)
+    covariance = np.diag([1.0, 4, 9, 1, 4, 9])
+    errors = rng.multivariate_normal(np.zeros(6), covariance, 4000)
+    figure = plots.plot_errors(errors, covariance)
+    shares = [float(axes.get_title().split(": ")[1].split(" %")[0]) for axes in figure.axes]
+    np.testing.assert_allclose(shares, 95, atol=1.5)
+    drawn(figure)
+    trusted = rng.random((50, 4)) < 0.5
+    history = tj.learn.History(rng.random(50), trusted, np.where(trusted, 0.0, 1.0))
+    figure = plots.plot_training({"one": history, "other": history})
+    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2]
+    np.testing.assert_allclose(figure.axes[2].lines[0].get_ydata()[10:], 1)
+    drawn(figure)

@@ -24,7 +24,7 @@ def blurred(seed: int, *, scale=None) -> tj.Problem:
     rng = np.random.default_rng(seed)
     matches = random_matches(seed, N, wrong=0.4, scale=1.3)
     problem = problem_of(matches, scale=scale, confidence=rng.uniform(0.5, 1, N))
-    return replace(problem, dst=problem.dst + 0.04 * rng.normal(size=(N, 3)))
+    return replace(problem, dst=problem.dst + 0.02 * rng.normal(size=(N, 3)))
 
 
 def moved(problem: tj.Problem, gnc_mu: float, name: str, step) -> tuple[tj.Problem, float]:
@@ -154,15 +154,18 @@ def test_hopeless_items_are_finite_say_so_and_spoil_none(x64):
         replace(good, src=jnp.zeros((N, 3)), dst=jnp.zeros((N, 3))),
         problem_of(random_matches(14, N, wrong=1.0), scale=None),
     ]
-    total = lambda src, problem: jnp.sum(tj.soft_solve(replace(problem, src=src)).pose.matrix)
-    gradient = jax.jit(jax.vmap(jax.grad(total)))
-    solved = jax.jit(jax.vmap(tj.soft_solve))
+
+    def total(src, problem):
+        found = tj.soft_solve(replace(problem, src=src))
+        return jnp.sum(found.pose.matrix), found
+
+    gradient = jax.jit(jax.vmap(jax.value_and_grad(total, has_aux=True)))
     slopes = []
     for others in ([good] * len(hopeless), hopeless):
         batch = tj.stack_problems([good, *others])
-        found = solved(batch)
+        (_, found), slope = gradient(batch.src, batch)
         assert_finite(found)
-        slopes.append(np.asarray(gradient(batch.src, batch)))
+        slopes.append(np.asarray(slope))
         assert np.all(np.isfinite(slopes[-1]))
     np.testing.assert_array_equal(slopes[1][0], slopes[0][0])
     assert not np.any(found.ok[1:])
@@ -176,6 +179,7 @@ def test_a_control_that_makes_no_sense_is_no_success(mu, x64):
     assert found.status == tj.Status.NOT_CONVERGED
 
 
+@pytest.mark.slow
 def test_single_precision_follows_double():
     problem = blurred(11, scale=1.3)
     with jax.enable_x64(True):

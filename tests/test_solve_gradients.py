@@ -49,7 +49,9 @@ def nothing_of(problem: tj.Problem) -> dict:
 
 
 @pytest.mark.parametrize(
-    ("scale", "settings"), [(1.3, tj.Settings()), (None, CASCADE)], ids=["known", "cascade"]
+    ("scale", "settings"),
+    [(1.3, tj.Settings()), (None, CASCADE), (1.3, replace(CASCADE, tim_graph="complete"))],
+    ids=["known", "cascade", "complete cascade"],
 )
 def test_forward_reverse_and_central_differences_agree(scale, settings, x64):
     # The differences re-run the solver. So does the derivative with refinement; that of the cascade is
@@ -123,3 +125,68 @@ def test_a_hopeless_item_leaves_its_neighbours_untouched(x64):
     assert not np.any(answers[1].ok[1:])
     expected = [tj.Status.TOO_FEW_POINTS, tj.Status.TOO_FEW_POINTS, tj.Status.NO_CONSENSUS]
     np.testing.assert_array_equal(answers[1].status[1:], expected)
+
+
+def test_ambiguous_poses_have_gradient_zero_and_no_ok(x64):
+    rng = np.random.default_rng(0)
+    line = rng.uniform(-1, 1, (N, 1)) * [1.0, 2.0, 2.0]
+    spot = np.ones((N, 3))
+    two = np.where(np.arange(N)[:, None] % 2, [0.0, 0, 0], [1.0, 1, 1])
+    problems = [
+        replace(problem_of(matches_of(15), scale=None), src=jnp.asarray(x), dst=jnp.asarray(1.3 * x))
+        for x in (line, spot, two)
+    ]
+    total = lambda inputs, problem: jnp.sum(tj.solve(replace(problem, **inputs)).pose.matrix)
+    batch = tj.stack_problems(problems)
+    slopes = jax.jit(jax.vmap(jax.grad(total)))(inputs_of(batch), batch)
+    for name, slope in slopes.items():
+        np.testing.assert_array_equal(slope, 0, err_msg=name)
+    assert not np.any(_solve_batch(batch).ok)
+
+
+def test_single_precision_follows_double():
+    matches, cotangent = matches_of(11), np.random.default_rng(0).normal(size=(4, 4))
+
+    def gradient():
+        problem = problem_of(matches, scale=1.3)
+        total = lambda inputs: jnp.sum(cotangent * tj.solve(replace(problem, **inputs)).pose.matrix)
+        return jax.jit(jax.grad(total))(inputs_of(problem))
+
+    with jax.enable_x64(True):
+        exact = gradient()
+    for name, found in gradient().items():
+        assert found.dtype == jnp.float32
+        size = np.max(np.abs(exact[name]))
+        np.testing.assert_allclose(found, exact[name], atol=1e-3 * size, err_msg=name)
+
+
+def test_descent_through_the_solver_finds_what_distorts_its_input():
+    # One axis of the source is stretched; the true poses are known, half of the matches are wrong.
+    drawn = [random_matches(k, N, wrong=0.5, noise=0.2) for k in range(6)]
+    stretch = np.array([1.0, 1.06, 1.0])
+    seen = jnp.asarray(np.stack([d.src / stretch for d in drawn]), jnp.float32)
+    dst = jnp.asarray(np.stack([d.dst for d in drawn]), jnp.float32)
+    truth = jax.tree.map(lambda *x: jnp.asarray(np.stack(x), jnp.float32), *[d.truth for d in drawn])
+    traces = []
+
+    def loss(guess):
+        traces.append(1)
+
+        def one(src, dst, truth):
+            problem = tj.make_problem(src * guess, dst, noise_bound=0.15)
+            pose = tj.solve(problem, tj.Settings(clique="greedy")).pose
+            return tj.learn.point_loss(pose, truth, src * guess)
+
+        return jnp.mean(jax.vmap(one)(seen, dst, truth))
+
+    def step(guess, rate):
+        value, slope = jax.value_and_grad(loss)(guess)
+        return guess - rate * slope, value
+
+    # The whole descent is one program: the solver in it is traced once and compiled once.
+    rates = 0.1 * jnp.linspace(1, 0.1, 60)
+    found, values = jax.jit(lambda start: jax.lax.scan(step, start, rates))(jnp.ones(3))
+    assert len(traces) == 1
+    assert values[-1] < 0.6 * values[0]
+    assert values[1] < values[0]
+    np.testing.assert_allclose(found, stretch, atol=0.02)

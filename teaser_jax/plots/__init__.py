@@ -6,6 +6,7 @@ matplotlib state is read for layout or changed, and any backend will do. Save on
 extra ``viz`` and loads when a function is called.
 """
 
+from teaser_jax.plots.learning import plot_errors, plot_slopes, plot_training
 from teaser_jax.plots.proofs import plot_bounds, plot_certified, plot_landscape
 from teaser_jax.plots.stages import (
     BAD,
@@ -25,6 +26,7 @@ from teaser_jax.plots.stages import (
 
 __all__ = [
     "BAD", "DST", "GOOD", "INK", "PALE", "SRC",
-    "plot_bounds", "plot_certified", "plot_clique", "plot_graph", "plot_landscape", "plot_refinement",
-    "plot_registration", "plot_residuals", "plot_translation", "plot_trims",
+    "plot_bounds", "plot_certified", "plot_clique", "plot_errors", "plot_graph", "plot_landscape",
+    "plot_refinement", "plot_registration", "plot_residuals", "plot_slopes", "plot_training",
+    "plot_translation", "plot_trims",
 ]  # fmt: skip

@@ -361,15 +361,15 @@ def _edges(edge_bits: np.ndarray, clique: np.ndarray) -> tuple[np.ndarray, np.nd
     return unpack_host(np.asarray(edge_bits), len(clique)), clique
 
 
-def label(axes: Axes, title: str, x: str, y: str) -> None:
-    """Title and axes in the style of all pictures."""
+def label(axes: Axes, title: str, x: str, y: str, *, counts: bool = True) -> None:
+    """Title and axes in the style of all pictures; ``counts`` puts whole numbers at the vertical one."""
     from matplotlib.ticker import MaxNLocator
 
     axes.set_title(title, fontsize=10, color=INK)
     axes.set_xlabel(x, fontsize=9, color=INK)
     axes.set_ylabel(y, fontsize=9, color=INK)
     axes.tick_params(labelsize=8, colors=INK)
-    axes.yaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
+    axes.yaxis.set_major_locator(MaxNLocator("auto", integer=counts, steps=[1, 2, 5, 10]))
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
 
