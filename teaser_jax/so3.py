@@ -6,6 +6,7 @@ scalar **last**, ``(x, y, z, w)``, as in the paper.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -98,7 +99,9 @@ def _axes_of_one(matrix: Float[Array, "3 3"]) -> Axes:
 @_axes_of_one.def_vmap
 def _axes_of_many(size: int, batched: Any, matrices: Float[Array, "k 3 3"]) -> tuple[Axes, Any]:
     # LAPACK takes matrices one by one; turns of columns are vector work: a quarter of the time from 64 on.
-    return jax.vmap(leading_axes_jacobi)(matrices), (True, True)
+    # This may be traced after the block that allowed float64 has ended: its numbers must stay what they are.
+    with jax.enable_x64(True) if matrices.dtype == jnp.float64 else nullcontext():
+        return jax.vmap(leading_axes_jacobi)(matrices), (True, True)
 
 
 _leading_axes = jax.jit(_axes_of_one)  # traced once, not once a use: half of it is meant for other devices
@@ -134,8 +137,11 @@ def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
     start = jnp.concatenate([(matrix / jnp.where(size > 0, size, 1)).T, eye], axis=1)
     rows = lax.fori_loop(0, 3 * JACOBI_SWEEPS, turn, start)
     norms = jnp.sum(rows[:, :3] ** 2, axis=1)
-    first = jnp.argmax(norms)
-    third = 2 - jnp.argmin(norms[::-1])  # the last of equals: never `first`
+    # Written out: argmax is lowered after the block that allows float64, and would lose half of its digits.
+    x, y, z = norms
+    one, two = jnp.int32(1), jnp.int32(2)
+    first = jnp.where((x >= y) & (x >= z), 0 * one, jnp.where(y >= z, one, two))
+    third = jnp.where((z <= x) & (z <= y), two, jnp.where(y <= x, one, 0 * one))  # never `first`
     second = 3 - first - third
     u1 = _unit(rows[first, :3], eye[0])
     # A second axis of rounding noise only: any direction across the first will do.
