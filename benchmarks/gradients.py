@@ -283,7 +283,7 @@ def report(rows: list[dict]) -> str:
         f"| {100 * ratio:.2f} % | {said(ratio >= 0.99)} |",
         f"| host callback in that program | none | {'some' if batch['host_callback'] else 'none'} "
         f"| {said(not batch['host_callback'])} |",
-        f"| gradients of {sum(r['problems'] for r in checked)} problems, {len(KINDS)} kinds | all finite "
+        f"| gradients of {sum(r['problems'] for r in checked)} solves, {len(KINDS)} kinds | all finite "
         f"| {bad} not | {said(bad == 0)} |",
         "",
         f"`soft_solve`, N = 1000, gradient of the pose, with the solve in front: {megabytes[0]:.2f} MB and "

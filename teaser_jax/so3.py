@@ -195,8 +195,11 @@ def _nearest_rotation_jvp(primals: tuple, tangents: tuple) -> tuple:
     high = lax.Precision.HIGHEST
     rotation = nearest_rotation(matrix)
     turned = jnp.einsum("ji,jk->ik", rotation, d_matrix, precision=high)
-    adjugate, determinant, ambiguous = _system(matrix, rotation)
-    inverse = jnp.where(ambiguous, 0, adjugate / jnp.where(ambiguous, 1, determinant))
+    # Third powers follow: in units of the matrix none of them overflows.
+    size = lax.stop_gradient(jnp.max(jnp.abs(matrix)))
+    size = jnp.where(size > 0, size, 1)
+    adjugate, determinant, ambiguous = _system(matrix / size, rotation)
+    inverse = jnp.where(ambiguous, 0, adjugate / jnp.where(ambiguous, 1, determinant)) / size
     omega = jnp.einsum("ij,j->i", inverse, _axial(turned), precision=high)
     return rotation, jnp.einsum("ij,jk->ik", rotation, hat(omega), precision=high)
 
@@ -218,7 +221,8 @@ def _system(
 def is_ambiguous(matrix: Float[Array, "3 3"]) -> Bool[Array, ""]:
     """Whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirror image."""
     matrix = lax.stop_gradient(matrix)
-    return _system(matrix, nearest_rotation(matrix))[2]
+    size = jnp.max(jnp.abs(matrix))
+    return _system(matrix / jnp.where(size > 0, size, 1), nearest_rotation(matrix))[2]
 
 
 def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "..."]:

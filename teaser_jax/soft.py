@@ -54,6 +54,9 @@ class SoftSolution:
         return self.status == Status.OK
 
 
+LARGEST_CHANGE = 1e-2  # of a weight, however coarse the coordinates, that counts as none
+
+
 class _Data(NamedTuple):
     """All numbers that the softened cost depends on; unusable rows have no confidence."""
 
@@ -92,7 +95,8 @@ def soft_solve(
     Gradients: by the implicit function theorem, forward and reverse, in points, bounds, confidences,
     known scale, cbar2 and gnc_mu, of the pose and of the weights; second derivatives, too. Memory does not
     depend on the number of iterations. The derivative jumps where a residual crosses one of the two
-    thresholds; it is zero where the cost does not determine the pose.
+    thresholds; it is zero where the cost does not determine the pose. Where the status is NOT_CONVERGED it
+    is that of the last fit, and inexact.
 
     References: Yang, Antonante, Tzoumas, Carlone, RA-L 2020 (GNC-TLS); eq. (6).
     """
@@ -124,7 +128,12 @@ def _stationary(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[A
     curvature = _curvature(data, pose)
     slope = jax.grad(_energy)(jnp.zeros_like(curvature.unit), data, pose)
     step = jnp.where(settled, -_solved(curvature, slope), 0)
-    return _moved(pose, step, data), settled, curvature.determined
+    moved, zero = _moved(pose, step, data), jnp.zeros_like(step)
+    # So close to the end rounding decides which of two energies is lower.
+    slack = 1 + 64 * jnp.finfo(step.dtype).eps
+    better = _energy(zero, data, moved) <= slack * _energy(zero, data, pose)
+    pose = jax.tree.map(lambda x, y: jnp.where(better, x, y), moved, pose)
+    return pose, settled, curvature.determined
 
 
 def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Array, ""]]:
@@ -134,16 +143,17 @@ def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Arra
         settled: Array
         rounds: Array
 
+    def weigh(pose: Pose) -> Array:
+        r2 = squared_residuals(pose, data.src, data.dst, data.noise_bound)
+        return gnc_weights(r2, data.gnc_mu, data.cbar2)
+
     # Fits converge linearly, and one step of Newton's method after them squares what is left. But no
     # further than rounding allows: it changes a weight by (1 + mu) times what it changes a residual.
     eps = jnp.finfo(data.src.dtype).eps
     largest = jnp.maximum(jnp.abs(data.src), jnp.abs(data.dst))
-    reach = jnp.max(largest / data.noise_bound[:, None], initial=1)
-    smallest_change = jnp.maximum(2 * eps**0.5, 16 * eps * (1 + data.gnc_mu) * reach)
-
-    def weigh(pose: Pose) -> Array:
-        r2 = squared_residuals(pose, data.src, data.dst, data.noise_bound)
-        return gnc_weights(r2, data.gnc_mu, data.cbar2)
+    reach = jnp.max(jnp.where(weigh(start) > 0, jnp.max(largest, axis=1) / data.noise_bound, 1), initial=1)
+    rounding = jnp.minimum(16 * eps * (1 + data.gnc_mu) * reach, LARGEST_CHANGE)
+    smallest_change = jnp.maximum(2 * eps**0.5, rounding)
 
     def step(state: Descent) -> Descent:
         weights = data.confidence / data.noise_bound**2 * state.weights
@@ -168,7 +178,7 @@ class _Curvature(NamedTuple):
 def _energy(step: Float[Array, " d"], data: _Data, pose: Pose) -> Float[Array, ""]:
     """Half the softened cost after a step from the pose: a turn and a shift about the middle, log scale."""
     rotation = pose.rotation @ _turn(step[:3])
-    scale = pose.scale * (1 if data.scale is None else data.scale / lax.stop_gradient(data.scale))
+    scale = pose.scale if data.scale is None else data.scale
     if data.scale is None:
         scale = scale * (1 + step[6] + 0.5 * step[6] ** 2)  # e^x to second order
     middle = _middle(data)
@@ -226,6 +236,7 @@ def _stationary_jvp(iterations: int, primals: tuple, tangents: tuple) -> tuple[A
     (data, start), (d_data, _) = primals, tangents
     pose, settled, determined = _stationary(data, start, iterations)
     curvature = _curvature(data, pose)
+    curvature = curvature._replace(determined=curvature.determined & determined)
     zero = jnp.zeros_like(curvature.unit)
     slope = lambda data: jax.grad(_energy)(zero, data, pose)
     _, d_slope = jax.jvp(slope, (data,), (d_data,))

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from teaser_jax import so3
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.solve import refit, usable_rows
-from teaser_jax.stages.invariants import safe_norm
+from teaser_jax.stages.invariants import safe_norm, safe_sqrt
 from teaser_jax.stages.refinement import squared_residuals
 from teaser_jax.types import Pose, Problem, Solution
 
@@ -35,8 +36,8 @@ class Uncertainty:
     Attributes:
         covariance: Of the error of the pose; infinite on the diagonal, and zero beside it, where the
             solution is not ``ok``.
-        information: Its inverse; zero where the solution is not ``ok``, so that in a graph of poses it
-            weighs nothing.
+        information: Its inverse; infinite on the diagonal where some errors are exactly zero. Zero where the
+            solution is not ``ok``, so that in a graph of poses it weighs nothing.
         convention: Which coordinates, as asked for.
     """
 
@@ -79,11 +80,16 @@ def covariance(
         Covariance and information. Pure under jit and vmap; outside, numpy problems give numpy in float64.
 
     Raises:
-        ValueError: For another convention, or a ``sigma`` of the wrong shape or below 0.
+        ValueError: For another convention, a stack, or a ``sigma`` of the wrong shape or below 0.
 
     Gradients: exact, through the second derivative of the fit.
     """
     _check_convention(convention)
+    if problem.src.ndim != 2 or np.shape(solution.inliers) != problem.src.shape[:1]:
+        raise ValueError(
+            f"covariance takes one problem and its solution, received src of shape {problem.src.shape} and "
+            f"inliers of shape {np.shape(solution.inliers)}: use jax.vmap for a stack."
+        )
     if sigma is not None:
         sigma = _checked(sigma, problem)
     if isinstance(problem.src, np.ndarray) and not is_traced(problem, solution, sigma):
@@ -107,15 +113,15 @@ def pose_difference(
     Raises:
         ValueError: For another convention.
 
-    Gradients: exact, but zero where the rotations are equal or opposite.
+    Gradients: exact, but where the rotations are opposite and the axis of the turn jumps.
     """
     _check_convention(convention)
     pose, truth = (jax.tree.map(jnp.asarray, x) for x in (pose, truth))
     between = jnp.einsum("ji,jk->ik", pose.rotation, truth.rotation, precision=jax.lax.Precision.HIGHEST)
-    axis = 0.5 * _axial(between)
-    sine = safe_norm(axis)
-    angle = jnp.arctan2(sine, 0.5 * (jnp.trace(between) - 1))
-    turn = axis * jnp.where(sine > 0, angle / jnp.where(sine > 0, sine, 1), 1)
+    quat = so3.quat_from_rotation(between)
+    sine = safe_norm(quat[:3])
+    half = jnp.arctan2(sine, quat[3])
+    turn = 2 * quat[:3] * jnp.where(sine > 0, half / jnp.where(sine > 0, sine, 1), 1)
     shift = (truth.translation - pose.translation) @ pose.rotation
     scale = [jnp.log(truth.scale / pose.scale)[None]] if with_scale else []
     right = jnp.concatenate([turn, shift, *scale])
@@ -149,17 +155,21 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
     deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)
     to_first_order = lambda dst: _coordinates(refit(replace(p, dst=dst), solution.selection), pose, p)
     slope = jax.jacrev(to_first_order)(p.dst)  # (d, n, 3)
-    weighted = slope * jnp.where(p.mask, deviation, 0)[:, None]
+    deviation = jnp.broadcast_to(deviation, p.mask.shape)
+    weighted = slope * jnp.where(p.mask & jnp.isfinite(deviation), deviation, 0)[:, None]
     right = jnp.einsum("ani,bni->ab", weighted, weighted, precision=jax.lax.Precision.HIGHEST)
     change = _change(pose, len(right), convention)
     found = change @ right @ change.T
     eye = jnp.eye(len(found), dtype=found.dtype)
-    known = solution.ok & jnp.all(jnp.isfinite(found))
-    exact = jnp.min(jnp.diagonal(found)) <= 0  # no noise at all
+    sensible = jnp.all(jnp.where(solution.inliers, jnp.isfinite(deviation) & (deviation >= 0), True))
+    known = solution.ok & jnp.all(jnp.isfinite(found)) & sensible
     # Angles and lengths may be of very different size: invert in units of the deviations.
-    usable = known & ~exact
-    unit = jax.lax.rsqrt(jnp.where(usable, jnp.diagonal(found), 1))
-    inverse = unit[:, None] * jnp.linalg.inv(jnp.where(usable, unit[:, None] * found * unit, eye)) * unit
+    spread = jnp.diagonal(found)
+    unit = jax.lax.rsqrt(jnp.where(known & (spread > 0), spread, 1))
+    normalised = jnp.where(known, unit[:, None] * found * unit, eye)
+    least = jnp.linalg.eigvalsh(jax.lax.stop_gradient(normalised))[0]
+    exact = least <= 8 * jnp.finfo(found.dtype).eps  # some combination of coordinates has no noise at all
+    inverse = unit[:, None] * jnp.linalg.inv(jnp.where(exact, eye, normalised)) * unit
     infinite = jnp.where(eye > 0, jnp.inf, 0)
     return Uncertainty(
         covariance=jnp.where(known, found, infinite),
@@ -195,4 +205,4 @@ def _estimated(p: Problem, solution: Solution) -> Float[Array, " n"]:
     m = jnp.sum(solution.inliers, dtype=jnp.int32).astype(p.src.dtype)
     left = 3 * m - (6 if p.scale is not None else 7)
     total = jnp.sum(jnp.where(solution.inliers, r2, 0))
-    return p.noise_bound * jnp.sqrt(total / jnp.maximum(left, 1))
+    return p.noise_bound * safe_sqrt(total / jnp.maximum(left, 1))

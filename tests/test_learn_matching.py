@@ -79,3 +79,22 @@ def test_descriptors_of_any_size_are_finite(size):
     a, b = descriptors(5, 6, 8)
     found = match(jnp.asarray(size * a, jnp.float32), jnp.asarray(b, jnp.float32))
     assert np.all(np.isfinite(found.confidence))
+
+
+def test_descriptors_that_are_not_finite_match_nothing_and_spoil_no_gradient(x64):
+    a, b = descriptors(6, 6, 8)
+    a[1], b[2] = np.nan, np.inf
+    found = match(a, b, mutual=False)
+    assert not found.mask[1]
+    assert not np.any(found.counterpart[found.mask] == 2)
+    slope = jax.grad(lambda a: jnp.sum(match(a, jnp.asarray(b)).confidence))(jnp.asarray(a))
+    assert np.all(np.isfinite(slope))
+
+
+def test_nonsense_is_refused():
+    a, b = (jnp.asarray(x) for x in descriptors(7, 6, 8))
+    for bad in (lambda: match(a, b[:, :3]), lambda: match(a, b[:0]), lambda: match(a[None], b[None])):
+        with pytest.raises(ValueError, match="expected"):
+            bad()
+    with pytest.raises(ValueError, match="temperature"):
+        match(a, b, temperature=-1.0)

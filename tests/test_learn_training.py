@@ -127,3 +127,24 @@ def test_a_checkpoint_is_the_leaves_of_a_tree(pairs, tmp_path):
         with np.load(tmp_path / "checkpoint.npz") as stored:
             again = jax.tree.unflatten(shape, [stored[f"arr_{k}"] for k in range(len(leaves))])
         jax.tree.map(np.testing.assert_array_equal, again, thing)
+
+
+def test_a_point_that_is_no_number_is_a_masked_point():
+    pair = synthetic.scan_pair(0, synthetic.teapot(20_000), n=SIZE)
+    network = learn.init_network(jax.random.key(0))
+    spoiled = pair.src.copy()
+    spoiled[3] = np.nan
+    scan = scan_of(spoiled, pair.src_viewpoint)
+    assert not scan.mask[3]
+    assert np.all(np.isfinite(learn.describe(network, scan)))
+
+
+def test_pairs_that_do_not_fit_are_refused(pairs):
+    network = learn.init_network(jax.random.key(0))
+    half = pairs._replace(dst=jax.tree.map(lambda x: x[:6], pairs.dst))
+    with pytest.raises(ValueError, match="one of each"):
+        learn.train(network, half, jax.random.key(0), optimizer=OPTIMIZER, steps=1)
+    with pytest.raises(ValueError, match="1 or more"):
+        learn.train(network, pairs, jax.random.key(0), optimizer=OPTIMIZER, steps=1, points=0)
+    with pytest.raises(ValueError, match="no true poses"):
+        learn.truth_labels(network, pairs._replace(truth=None), 0.05)

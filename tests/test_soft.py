@@ -201,3 +201,12 @@ def test_memory_does_not_grow_with_the_iterations():
         return jax.jit(jax.grad(total)).lower(problem.dst).compile().memory_analysis().temp_size_in_bytes
 
     assert temporaries(500) == temporaries(5)
+
+
+@pytest.mark.slow
+def test_second_derivatives_too(x64):
+    problem = blurred(11, scale=1.3)
+    of = lambda scale: tj.soft_solve(replace(problem, scale=scale)).pose.translation[0]
+    slope = jax.jit(jax.grad(of))
+    central = (slope(1.3 + 1e-5) - slope(1.3 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(of)))(1.3), central, rtol=1e-5)

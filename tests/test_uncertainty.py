@@ -142,3 +142,18 @@ def test_the_difference_of_equal_poses_is_zero_and_has_a_finite_gradient(x64):
     np.testing.assert_allclose(tj.pose_difference(pose, pose), 0, atol=1e-15)
     slope = jax.grad(lambda p: jnp.sum(tj.pose_difference(p, pose, with_scale=True)))(pose)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(slope))
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1.0, np.pi - 1e-9, np.pi])
+def test_every_turn_is_seen_in_full(angle, x64):
+    pose = jax.tree.map(jnp.asarray, random_matches(0).truth)
+    turn = tj.so3.rotation_from_quat(jnp.asarray([np.sin(angle / 2), 0, 0, np.cos(angle / 2)]))
+    found = tj.pose_difference(pose, replace(pose, rotation=pose.rotation @ turn))
+    assert np.linalg.norm(found[:3]) == pytest.approx(angle, abs=1e-12)
+
+
+def test_a_stack_and_a_solution_of_another_problem_are_refused():
+    matches, others = random_matches(8, N), random_matches(8, N + 1)
+    result, other = (tj.register(m.src, m.dst, noise_bound=0.05) for m in (matches, others))
+    with pytest.raises(ValueError, match="one problem and its solution"):
+        tj.covariance(result.problem, other.solution)

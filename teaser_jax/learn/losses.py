@@ -10,16 +10,14 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from teaser_jax.learn.matching import similarities
+from teaser_jax.learn.matching import centred, similarities
 from teaser_jax.stages.invariants import safe_norm
 from teaser_jax.types import Pose
 
 
 def masked_mean(values: Float[Array, "..."], mask: Bool[Array, "..."] | None) -> Float[Array, ""]:
     """The mean of the values under the mask; 0 if there are none."""
-    if mask is None:
-        return jnp.mean(values)
-    mask = jnp.broadcast_to(mask, values.shape)
+    mask = jnp.ones(values.shape, bool) if mask is None else jnp.broadcast_to(mask, values.shape)
     count = jnp.sum(mask, dtype=values.dtype)
     return jnp.sum(jnp.where(mask, values, 0)) / jnp.maximum(count, 1)
 
@@ -52,8 +50,9 @@ def point_loss(
 
     Gradients: exact; zero for points that do not move.
     """
+    mask = jnp.ones(points.shape[:-1], bool) if mask is None else mask
+    points = jnp.where(mask[..., None], points, 0)
     apart = safe_norm(pose.apply(points) - truth.apply(points))
-    mask = jnp.ones(apart.shape, bool) if mask is None else mask
     count = jnp.sum(mask, axis=-1, dtype=apart.dtype)
     return jnp.sum(jnp.where(mask, apart, 0), axis=-1) / jnp.maximum(count, 1)
 
@@ -70,6 +69,7 @@ def inlier_loss(
     Gradients: exact.
     """
     mask = jnp.ones(logits.shape, bool) if mask is None else mask
+    logits = jnp.where(mask, logits, 0)
     right = masked_mean(-jax.nn.log_sigmoid(logits), mask & inliers)
     wrong = masked_mean(-jax.nn.log_sigmoid(-logits), mask & ~inliers)
     return 0.5 * (right + wrong)
@@ -91,6 +91,8 @@ def keypoint_loss(
 
     References: the Geman-McClure cost, as in Yang et al., RA-L 2020.
     """
+    if mask is not None:
+        src, dst = (jnp.where(mask[..., None], x, 0) for x in (src, dst))
     difference = dst - pose.apply(src)
     r2 = jnp.sum(difference * difference, axis=-1) / jnp.asarray(noise_bound, src.dtype) ** 2
     return masked_mean(r2 / (1 + r2), mask)
@@ -105,6 +107,8 @@ def matching_loss(
     *,
     radius: float,
     temperature: float = 0.1,
+    src_mask: Bool[Array, " n"] | None = None,
+    dst_mask: Bool[Array, " m"] | None = None,
 ) -> Float[Array, ""]:
     """Descriptors of the same place should be alike, given a pose: a contrastive loss [nat].
 
@@ -118,18 +122,26 @@ def matching_loss(
         pose: ``T_dst_src``, true or from the ``teacher``.
         radius: See above [length].
         temperature: Difference of similarity that counts.
+        src_mask, dst_mask: Points that take part; None: all.
 
     Gradients: exact in the descriptors; points and pose decide who is who and have none.
 
     References: van den Oord et al., 2018 (InfoNCE); Khosla et al., NeurIPS 2020 (many positives).
     """
     src, dst, pose = lax.stop_gradient((src, dst, pose))
-    moved = pose.apply(src)
+    src_mask = jnp.ones(len(src), bool) if src_mask is None else src_mask
+    dst_mask = jnp.ones(len(dst), bool) if dst_mask is None else dst_mask
+    src_descriptors = jnp.where(src_mask[:, None], src_descriptors, 0)
+    dst_descriptors = jnp.where(dst_mask[:, None], dst_descriptors, 0)
+    # About one middle: squares of far coordinates would cancel.
+    both = centred(jnp.concatenate([pose.apply(src), dst]), jnp.concatenate([src_mask, dst_mask]))
+    moved, dst = both[: len(src)], both[len(src) :]
+    either = src_mask[:, None] & dst_mask
     distance2 = (
         jnp.sum(moved * moved, axis=1)[:, None] + jnp.sum(dst * dst, axis=1) - 2 * similarities(moved, dst)
     )
-    same = distance2 < radius**2
-    asked = same | (distance2 > 4 * radius**2)
+    same = either & (distance2 < radius**2)
+    asked = same | (either & (distance2 > 4 * radius**2))
     # Unit descriptors have similarities up to 1: nothing overflows, and no maximum has to be found.
     weight = jnp.exp((similarities(src_descriptors, dst_descriptors) - 1) / temperature)
     tiny = jnp.finfo(weight.dtype).tiny

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
+
+from teaser_jax.problem import is_traced
 
 
 class Matches(NamedTuple):
@@ -46,15 +48,20 @@ def match(
         src_mask, dst_mask: Points that take part; None: all.
 
     Returns:
-        Matches in the order of the source; those of masked points are masked and have confidence 0.
+        Matches in the order of the source; those of masked points, and of points whose descriptor is not
+        finite, are masked and have confidence 0.
+
+    Raises:
+        ValueError: On shapes that do not fit, no target, or a temperature that is not above 0.
 
     Gradients: of the confidences, exact; the counterparts and the mask are choices and have none.
 
     References: Sun et al., LoFTR, CVPR 2021 (dual softmax).
     """
-    n, m = len(src_descriptors), len(dst_descriptors)
-    src_mask = jnp.ones(n, bool) if src_mask is None else src_mask
-    dst_mask = jnp.ones(m, bool) if dst_mask is None else dst_mask
+    _check(src_descriptors, dst_descriptors, temperature)
+    n = len(src_descriptors)
+    src_descriptors, src_mask = _finite(src_descriptors, src_mask)
+    dst_descriptors, dst_mask = _finite(dst_descriptors, dst_mask)
     similarity = similarities(src_descriptors, dst_descriptors) / temperature
     either = src_mask[:, None] & dst_mask
     similarity = jnp.where(either, similarity, _least(similarity))
@@ -85,11 +92,44 @@ def soft_counterparts(
 
     References: Wang, Solomon, Deep Closest Point, ICCV 2019.
     """
+    _check(src_descriptors, dst_descriptors, temperature)
+    src_descriptors, _ = _finite(src_descriptors, None)
+    dst_descriptors, dst_mask = _finite(dst_descriptors, dst_mask)
     similarity = similarities(src_descriptors, dst_descriptors) / temperature
-    if dst_mask is not None:
-        similarity = jnp.where(dst_mask, similarity, _least(similarity))
-        dst = jnp.where(dst_mask[:, None], dst, 0)
+    similarity = jnp.where(dst_mask, similarity, _least(similarity))
+    dst = jnp.where(dst_mask[:, None], dst, 0)
     return jnp.matmul(jax.nn.softmax(similarity, axis=1), dst, precision=lax.Precision.HIGHEST)
+
+
+def _check(src_descriptors: Array, dst_descriptors: Array, temperature: Any) -> None:
+    shapes = src_descriptors.shape, dst_descriptors.shape
+    if not all(len(s) == 2 and s[0] > 0 for s in shapes) or shapes[0][1] != shapes[1][1]:
+        raise ValueError(
+            f"descriptors have shapes {shapes[0]} and {shapes[1]}: expected (n, d) and (m, d), one or "
+            "more each; use jax.vmap for batches."
+        )
+    if not is_traced(temperature) and not float(temperature) > 0:
+        raise ValueError(f"temperature is {temperature}: expected a number above 0.")
+
+
+def _finite(descriptors: Array, mask: Array | None) -> tuple[Array, Array]:
+    """Descriptors made harmless before anything is computed from them, and which of them are to be used."""
+    finite = jnp.all(jnp.isfinite(descriptors), axis=1)
+    mask = finite if mask is None else mask & finite
+    return jnp.where(mask[:, None], descriptors, 0), mask
+
+
+def as_float(x: Any) -> Array:
+    """Integers become float32, floats stay what they are."""
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.float32)
+
+
+def centred(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
+    """About the mean of the points under the mask; the others at the origin."""
+    present = mask.astype(points.dtype)[:, None]
+    mean = jnp.sum(present * points, axis=0) / jnp.maximum(jnp.sum(present), 1)
+    return present * (points - mean)
 
 
 def similarities(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:

@@ -8,6 +8,7 @@ Rings are matrices and means are products of matrices, which any device does wel
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from teaser_jax.learn.matching import as_float, centred, similarities
 
 BINS = 5
 PREFERENCE = 0.01  # for the direction to the sensor as a normal, against a spread of the radius squared
@@ -52,15 +55,16 @@ def read_scan(
     Args:
         points: A scan [length].
         viewpoint: Where the sensor stood, in the frame of the scan; it tells outside from inside.
-        mask: Points that exist; None: all.
+        mask: Points that exist; None: all. Points that are not finite are masked.
         reach: How far a neighbour can be [length]: a third of an object.
 
     Gradients: none; the scan is data.
 
     References: Drost et al., CVPR 2010 (pairs of oriented points); Rusu et al., ICRA 2009 (histograms).
     """
-    points, viewpoint = lax.stop_gradient((points, viewpoint))
+    points, viewpoint = lax.stop_gradient((as_float(points), as_float(viewpoint)))
     mask = jnp.ones(len(points), bool) if mask is None else mask
+    mask &= jnp.all(jnp.isfinite(points), axis=1)  # one NaN would reach every mean
     points = jnp.where(mask[:, None], points, 0)
     difference = points[None] - points[:, None]
     distance = jnp.sqrt(jnp.sum(difference**2, axis=2))
@@ -139,9 +143,9 @@ def _normalise(x: Array) -> Array:
 
 def _rings(scan: Scan) -> list[tuple[Array, Array]]:
     """Who is in which ring of whom, as 0 and 1, and one over how many: the mean is a product and a factor."""
-    x = lax.stop_gradient(scan.points)
+    x = centred(lax.stop_gradient(scan.points), scan.mask)
     length2 = jnp.sum(x * x, axis=1)
-    distance2 = length2[:, None] + length2 - 2 * x @ x.T
+    distance2 = length2[:, None] + length2 - 2 * similarities(x, x)
     found, inner = [], jnp.asarray(-jnp.inf, x.dtype)
     for level in LEVELS:
         outer = (level * scan.reach) ** 2
@@ -160,11 +164,11 @@ def _normals(
     """
     weight = (near | jnp.eye(len(points), dtype=bool)).astype(points.dtype)
     count = jnp.sum(weight, axis=1, keepdims=True)
-    present = mask.astype(points.dtype)
-    centred = points - present @ points / jnp.maximum(jnp.sum(present), 1)  # so that squares do not cancel
-    mean = weight @ centred / count
-    outer = (centred[:, :, None] * centred[:, None, :]).reshape(len(points), 9)
-    spread = (weight @ outer / count).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
+    near_origin = centred(points, mask)  # so that squares do not cancel
+    product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+    mean = product(weight, near_origin) / count
+    outer = (near_origin[:, :, None] * near_origin[:, None, :]).reshape(len(points), 9)
+    spread = (product(weight, outer) / count).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
     sight = viewpoint - points
     sight = sight * lax.rsqrt(jnp.maximum(jnp.sum(sight**2, axis=1, keepdims=True), 1e-12))
     preferred = PREFERENCE * radius**2 * sight[:, :, None] * sight[:, None, :]

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from teaser_jax.learn.matching import as_float
 from teaser_jax.problem import make_problem
 from teaser_jax.solve import solve
 from teaser_jax.types import Pose, Settings
@@ -79,6 +80,9 @@ def teacher(
             f"src has shape {src.shape} and dst {dst.shape}: expected the same (..., n, 3), row i of src "
             "matched with row i of dst."
         )
+    if jnp.ndim(least_inliers) != 0:
+        raise ValueError(f"least_inliers has shape {jnp.shape(least_inliers)}: expected one number.")
+    src, dst = as_float(src), as_float(dst)  # integers would cut the bound
     batch = src.shape[:-1]
     mask = jnp.ones(batch, bool) if mask is None else jnp.broadcast_to(mask, batch)
     confidence = jnp.ones(batch, src.dtype) if confidence is None else jnp.broadcast_to(confidence, batch)

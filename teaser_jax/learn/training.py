@@ -103,7 +103,10 @@ def solver_labels(parameters: Parameters, pairs: Pairs, noise_bound: float) -> L
 
 def truth_labels(parameters: Parameters, pairs: Pairs, noise_bound: float) -> Labels:
     """Labels for ordinary supervision: true poses, all of them trusted."""
-    assert pairs.truth is not None, "the pairs have no true poses"
+    if pairs.truth is None:
+        raise ValueError(
+            "these pairs have no true poses to learn from: give Pairs.truth, or use solver_labels."
+        )
     batch, n = pairs.src.mask.shape
     nothing = jnp.zeros((batch, n), bool)
     return Labels(pairs.truth, nothing, jnp.ones(batch, bool), jnp.zeros(batch, jnp.int32))
@@ -141,15 +144,22 @@ def train(
 
     Returns:
         The trained parameters, and what happened.
+
+    Raises:
+        ValueError: If sources and targets differ in number, or nothing would be drawn.
     """
     count, n = pairs.src.mask.shape
-    points = min(points, n)
+    if pairs.dst.mask.shape[0] != count:
+        raise ValueError(f"{count} sources and {pairs.dst.mask.shape[0]} targets: pairs need one of each.")
+    if min(points, batch, steps) < 1:
+        raise ValueError(f"received points = {points}, batch = {batch}, steps = {steps}: expected 1 or more.")
+    drawn_src, drawn_dst = min(points, n), min(points, pairs.dst.mask.shape[1])
 
     def loss(parameters: Parameters, drawn: Pairs, taught: Labels) -> Array:
         def one(src: Scan, dst: Scan, pose: Pose) -> Array:
             return matching_loss(
                 describe(parameters, src), describe(parameters, dst), src.points, dst.points, pose,
-                radius=radius, temperature=temperature,
+                radius=radius, temperature=temperature, src_mask=src.mask, dst_mask=dst.mask,
             )  # fmt: skip
 
         return masked_mean(jax.vmap(one)(drawn.src, drawn.dst, taught.pose), taught.trusted)
@@ -159,8 +169,8 @@ def train(
         which, of_src, of_dst = jax.random.split(key, 3)
         drawn = jax.tree.map(lambda x: x[jax.random.randint(which, (batch,), 0, count)], pairs)
         drawn = drawn._replace(
-            src=_thinned(drawn.src, jax.random.permutation(of_src, n)[:points]),
-            dst=_thinned(drawn.dst, jax.random.permutation(of_dst, n)[:points]),
+            src=_thinned(drawn.src, jax.random.permutation(of_src, n)[:drawn_src]),
+            dst=_thinned(drawn.dst, jax.random.permutation(of_dst, drawn.dst.mask.shape[1])[:drawn_dst]),
         )
         taught = lax.stop_gradient(labels(parameters, drawn, noise_bound))
         value, slope = jax.value_and_grad(loss)(parameters, drawn, taught)

@@ -21,11 +21,11 @@ def gnc_weights(
 
     References: Yang, Antonante, Tzoumas, Carlone, RA-L 2020 (GNC-TLS).
     """
-    height = cbar2 * gnc_mu * (gnc_mu + 1)
     # Clipping reproduces both thresholds of the piecewise formula. The floor lies below the first one: it
     # changes no weight, and keeps the derivative at r = 0 finite.
     floor = jnp.maximum(0.25 * cbar2 * gnc_mu / (gnc_mu + 1), jnp.finfo(r2.dtype).tiny)
-    return jnp.clip(jnp.sqrt(height / jnp.maximum(r2, floor)) - gnc_mu, 0, 1)
+    # mu outside the root: mu^2 would overflow sooner than mu.
+    return jnp.clip(gnc_mu * (jnp.sqrt((1 + 1 / gnc_mu) * cbar2 / jnp.maximum(r2, floor)) - 1), 0, 1)
 
 
 def gnc_cost(r2: Float[Array, "*k"], gnc_mu: Float[Array, ""], cbar2: Float[Array, ""]) -> Float[Array, "*k"]:
@@ -37,5 +37,5 @@ def gnc_cost(r2: Float[Array, "*k"], gnc_mu: Float[Array, ""], cbar2: Float[Arra
     """
     low, high = cbar2 * gnc_mu / (gnc_mu + 1), cbar2 * (gnc_mu + 1) / gnc_mu
     within = jnp.clip(r2, low, high)
-    between = 2 * jnp.sqrt(cbar2 * gnc_mu * (gnc_mu + 1) * within) - gnc_mu * (cbar2 + within)
+    between = gnc_mu * (2 * jnp.sqrt((1 + 1 / gnc_mu) * cbar2 * within) - cbar2 - within)
     return jnp.where(r2 <= low, r2, jnp.where(r2 >= high, cbar2, between))
