@@ -52,7 +52,7 @@ def hat(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
-def _axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """``vee(G - G^T)``: twice the axis vector of the skew part."""
     return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
 
@@ -139,9 +139,9 @@ def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
     norms = jnp.sum(rows[:, :3] ** 2, axis=1)
     # Written out: argmax is lowered after the block that allows float64, and would lose half of its digits.
     x, y, z = norms
-    one, two = jnp.int32(1), jnp.int32(2)
-    first = jnp.where((x >= y) & (x >= z), 0 * one, jnp.where(y >= z, one, two))
-    third = jnp.where((z <= x) & (z <= y), two, jnp.where(y <= x, one, 0 * one))  # never `first`
+    zero, one, two = jnp.int32(0), jnp.int32(1), jnp.int32(2)
+    first = jnp.where((x >= y) & (x >= z), zero, jnp.where(y >= z, one, two))
+    third = jnp.where((z <= x) & (z <= y), two, jnp.where(y <= x, one, zero))  # never `first`
     second = 3 - first - third
     u1 = _unit(rows[first, :3], eye[0])
     # A second axis of rounding noise only: any direction across the first will do.
@@ -195,34 +195,33 @@ def _nearest_rotation_jvp(primals: tuple, tangents: tuple) -> tuple:
     high = lax.Precision.HIGHEST
     rotation = nearest_rotation(matrix)
     turned = jnp.einsum("ji,jk->ik", rotation, d_matrix, precision=high)
-    # Third powers follow: in units of the matrix none of them overflows.
-    size = lax.stop_gradient(jnp.max(jnp.abs(matrix)))
-    size = jnp.where(size > 0, size, 1)
-    adjugate, determinant, ambiguous = _system(matrix / size, rotation)
-    inverse = jnp.where(ambiguous, 0, adjugate / jnp.where(ambiguous, 1, determinant)) / size
-    omega = jnp.einsum("ij,j->i", inverse, _axial(turned), precision=high)
+    inverse, _ = _inverse(matrix, rotation)
+    omega = jnp.einsum("ij,j->i", inverse, axial(turned), precision=high)
     return rotation, jnp.einsum("ij,jk->ik", rotation, hat(omega), precision=high)
 
 
-def _system(
+def _inverse(
     matrix: Float[Array, "3 3"], rotation: Float[Array, "3 3"]
-) -> tuple[Float[Array, "3 3"], Float[Array, ""], Bool[Array, ""]]:
-    """Adjugate and determinant of tr(M) I - M, and whether it is singular."""
-    product = jnp.einsum("ji,jk->ik", rotation, matrix, precision=lax.Precision.HIGHEST)
+) -> tuple[Float[Array, "3 3"], Bool[Array, ""]]:
+    """The inverse of tr(M) I - M, and whether there is none; it is zero then."""
+    # Third powers follow: in units of the matrix none of them overflows.
+    size = lax.stop_gradient(jnp.max(jnp.abs(matrix)))
+    size = jnp.where(size > 0, size, 1)
+    product = jnp.einsum("ji,jk->ik", rotation, matrix / size, precision=lax.Precision.HIGHEST)
     product = 0.5 * (product + product.T)
     trace = jnp.trace(product)
     system = trace * jnp.eye(3, dtype=matrix.dtype) - product
     c0, c1, c2 = system[:, 0], system[:, 1], system[:, 2]
     adjugate = jnp.stack([_cross(c1, c2), _cross(c2, c0), _cross(c0, c1)])
     determinant = jnp.sum(c0 * adjugate[0])
-    return adjugate, determinant, determinant <= 64 * jnp.finfo(matrix.dtype).eps * jnp.abs(trace) ** 3
+    ambiguous = determinant <= 64 * jnp.finfo(matrix.dtype).eps * jnp.abs(trace) ** 3
+    return jnp.where(ambiguous, 0, adjugate / jnp.where(ambiguous, 1, determinant)) / size, ambiguous
 
 
 def is_ambiguous(matrix: Float[Array, "3 3"]) -> Bool[Array, ""]:
     """Whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirror image."""
     matrix = lax.stop_gradient(matrix)
-    size = jnp.max(jnp.abs(matrix))
-    return _system(matrix / jnp.where(size > 0, size, 1), nearest_rotation(matrix))[2]
+    return _inverse(matrix, nearest_rotation(matrix))[1]
 
 
 def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "..."]:

@@ -128,11 +128,6 @@ def pose_difference(
     return _change(pose, len(right), convention) @ right
 
 
-def _axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    skew = matrix - matrix.T
-    return jnp.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
-
-
 def _check_convention(convention: Any) -> None:
     if convention not in get_args(Convention):
         allowed = ", ".join(repr(x) for x in get_args(Convention))
@@ -181,7 +176,7 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
 def _coordinates(pose: Pose, about: Pose, problem: Problem) -> Float[Array, " d"]:
     """Small errors of a pose about another, in the axes of the source: turn, shift, log scale if unknown."""
     between = jnp.einsum("ji,jk->ik", about.rotation, pose.rotation, precision=jax.lax.Precision.HIGHEST)
-    turn = 0.5 * _axial(between)
+    turn = 0.5 * so3.axial(between)
     shift = (pose.translation - about.translation) @ about.rotation
     scale = [] if problem.scale is not None else [(pose.scale / about.scale - 1)[None]]
     return jnp.concatenate([turn, shift, *scale])
