@@ -31,19 +31,23 @@ class PackedProblem(NamedTuple):
 
 
 def pack_problem(problem: Problem, settings: Settings, n: int, m: int | None) -> PackedProblem:
-    """A problem on the host, padded to n rows and m pairs; padding is masked and changes nothing."""
-    count = len(problem.src)
-    columns = np.zeros((9, n))
-    columns[:3, :count], columns[3:6, :count] = problem.src.T, problem.dst.T
-    columns[6, :count], columns[7, :count] = problem.noise_bound, problem.confidence
-    columns[8, :count] = problem.mask
+    """A problem on the host, or a stack of them, padded to n rows and m pairs; padding is masked."""
+    *front, count, _ = problem.src.shape
+    columns = np.zeros((*front, 9, n))
+    columns[..., :3, :count] = np.swapaxes(problem.src, -1, -2)
+    columns[..., 3:6, :count] = np.swapaxes(problem.dst, -1, -2)
+    columns[..., 6, :count], columns[..., 7, :count] = problem.noise_bound, problem.confidence
+    columns[..., 8, :count] = problem.mask
     known = () if problem.scale is None else (problem.scale,)
-    numbers = (problem.cbar2, settings.gnc_factor, settings.gnc_tolerance, *settings.scale_range, *known)
+    each = (problem.cbar2, settings.gnc_factor, settings.gnc_tolerance, *settings.scale_range, *known)
+    numbers = np.empty((*front, len(each)))
+    for k, number in enumerate(each):
+        numbers[..., k] = number
     pairs = None
     if problem.pairs is not None and m is not None:
-        pairs = np.zeros((m, 2), np.int32)
-        pairs[: len(problem.pairs)] = problem.pairs
-    return PackedProblem(columns, np.array(numbers, np.float64), pairs)
+        pairs = np.zeros((*front, m, 2), np.int32)
+        pairs[..., : problem.pairs.shape[-2], :] = problem.pairs
+    return PackedProblem(columns, numbers, pairs)
 
 
 def unpack_problem(packed: PackedProblem, choices: Settings) -> tuple[Problem, Settings]:
@@ -106,16 +110,17 @@ def fetched(solution: PackedSolution) -> PackedSolution:
 
 
 def unpack_solution(host: PackedSolution) -> Solution:
-    """The solution again, in numpy."""
+    """The solution again, or a stack of them, in numpy."""
     numbers, masks, (scale_pairs, rotation) = host
-    pose = Pose(numbers[:9].reshape(3, 3), numbers[9:12], numbers[12])
-    counts = numbers[14:].astype(np.int32)
-    columns = np.ascontiguousarray(masks.T)
+    front = numbers.shape[:-1]
+    pose = Pose(numbers[..., :9].reshape(*front, 3, 3), numbers[..., 9:12], numbers[..., 12])
+    counts = np.moveaxis(numbers[..., 14:].astype(np.int32), -1, 0)
+    columns = np.ascontiguousarray(np.moveaxis(masks, -1, 0))
     selection = Selection(
         scale_pairs=scale_pairs,
         clique=columns[0],
         rotation=columns[5] if rotation is None else rotation,
-        translation=masks[:, 2:5],
+        translation=masks[..., 2:5],
         inliers=columns[1],
         refined=counts[5].astype(bool),
     )
@@ -128,5 +133,5 @@ def unpack_solution(host: PackedSolution) -> Solution:
         clique_upper_bound=counts[2],
         clique_is_maximum=counts[3].astype(bool),
         excluded=counts[4],
-        cost=numbers[13],
+        cost=numbers[..., 13],
     )

@@ -102,7 +102,7 @@ def read_problem(
 def stack_problems(problems: Sequence[Problem]) -> Problem:
     """Problems of any sizes as one batch: padded to the largest, padding masked.
 
-    Gradients: exact.
+    Numpy arrays stay numpy. Gradients: exact.
 
     Raises:
         ValueError: If there are none, or scale or pairs are given in some but not in all.
@@ -116,7 +116,9 @@ def stack_problems(problems: Sequence[Problem]) -> Problem:
     n = max(p.src.shape[0] for p in problems)
     sizes = [p.pairs.shape[0] for p in problems if p.pairs is not None]
     m = max(sizes, default=None)
-    return jax.tree.map(lambda *x: jnp.stack(x), *[pad_problem(p, n, m) for p in problems])
+    on_host = not any(isinstance(x, jax.Array) for x in jax.tree.leaves(problems))
+    stack = np.stack if on_host else jnp.stack
+    return jax.tree.map(lambda *x: stack(x), *[pad_problem(p, n, m) for p in problems])
 
 
 def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from numbers import Integral
 from typing import Any
 
@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import compile_ahead
 from teaser_jax.certify.pose import MAX_TRACED
@@ -33,7 +34,7 @@ from teaser_jax.stages.clique_search import load_kernels
 from teaser_jax.stages.consistency import rounding
 from teaser_jax.stages.invariants import words
 from teaser_jax.summary import summary
-from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
+from teaser_jax.types import Pose, Problem, Settings, Solution, Status
 
 SMALLEST_BUCKET = 32
 INSIDE_JIT = (
@@ -152,7 +153,7 @@ def _solved(problem: Problem, settings: Settings, dtype: type) -> Solution:
     """Device, host, device; edges are tested in ``dtype``."""
     sent = pack_problem(problem, settings, *buckets(problem))
     with jax.enable_x64(True):
-        graph, found, proved = before_clique(sent, choices_of(settings), dtype)
+        graph, found, proved = _before(sent, choices_of(settings), dtype)
         clique = between(sent, graph, found, proved, settings)
         return concluded(sent, graph, clique, settings)
 
@@ -220,7 +221,10 @@ def check_settings(settings: Settings) -> None:
 
 
 def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
-    """``make_problem`` in float64 numpy, from anything that can be read on the host."""
+    """``make_problem`` in float64 numpy, from anything that can be read on the host: for ``solve_batch``.
+
+    Takes the arguments of ``make_problem`` and raises what it raises.
+    """
     return read_problem(src, dst, dtype=np.dtype(np.float64), **known)
 
 
@@ -232,11 +236,11 @@ def centre(problem: Problem, usable: np.ndarray | slice) -> tuple[Problem, tuple
     src, dst = problem.src[usable], problem.dst[usable]
     if not len(src):
         return problem, (np.zeros(3), np.zeros(3))
-    origins = _median(src), _median(dst)
+    origins = median(src), median(dst)
     return replace(problem, src=problem.src - origins[0], dst=problem.dst - origins[1]), origins
 
 
-def _median(points: Any) -> np.ndarray:
+def median(points: Any) -> np.ndarray:
     """Of each coordinate, the upper one of two: a third of the time of ``numpy.median``."""
     half = len(points) // 2
     return np.partition(np.ascontiguousarray(points.T), half, axis=1)[:, half]
@@ -269,11 +273,15 @@ def edge_dtype(problem: Problem, usable: np.ndarray | slice) -> type:
         return np.float64
     reach = np.sqrt(3) * (problem.scale * extent(src) + extent(dst))
     bound = np.sqrt(problem.cbar2) * problem.noise_bound[usable].min()
-    in_range = bound > 1e-6 and reach < 1e6  # their fourth powers are compared
-    return np.float32 if in_range and rounding(np.float32, reach) <= 1e-3 * bound else np.float64
+    return np.float32 if float32_will_do(reach, bound) else np.float64
 
 
-@partial(jax.jit, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)
+def float32_will_do(reach: Any, bound: Any) -> Any:
+    """Whether rounding of points that reach so far widens a bound by a thousandth at most."""
+    in_range = (bound > 1e-6) & (reach < 1e6)  # their fourth powers are compared
+    return in_range & (rounding(np.float32, reach) <= 1e-3 * bound)
+
+
 def before_clique(sent: PackedProblem, choices: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
     """Device program one: scale, graph, and the clique as far as the device takes it; is it proved?"""
     problem, settings = unpack_problem(sent, choices)
@@ -299,11 +307,14 @@ def between(
     )  # fmt: skip
 
 
-@partial(jax.jit, compiler_options=WHOLE_SUMS | OLDER_EMITTERS)
 def after_clique(sent: PackedProblem, graph: Graph, clique: Clique, choices: Settings) -> PackedSolution:
     """Device program two: the sets, the pose, the verdict."""
     problem, settings = unpack_problem(sent, choices)
     return pack_solution(conclude(problem, graph, clique, settings))
+
+
+_before = jax.jit(before_clique, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)
+_after = jax.jit(after_clique, compiler_options=WHOLE_SUMS | OLDER_EMITTERS)
 
 
 def concluded(sent: PackedProblem, graph: Graph, clique: Clique, settings: Settings) -> Solution:
@@ -311,38 +322,47 @@ def concluded(sent: PackedProblem, graph: Graph, clique: Clique, settings: Setti
     if settings.rotation == "sdp":
         problem, settings = unpack_problem(sent, settings)
         return jax.device_get(conclude(problem, graph, clique, settings))
-    return unpack_solution(fetched(after_clique(sent, graph, clique, choices_of(settings))))
+    return unpack_solution(fetched(_after(sent, graph, clique, choices_of(settings))))
 
 
 def registration_of(
     solution: Solution, problem: Problem, origins: tuple[np.ndarray, np.ndarray]
 ) -> Registration:
     """The padded and centred solution, in the frames and rows of the user's problem."""
-    n = problem.src.shape[0]
-    m = None if problem.pairs is None else problem.pairs.shape[0]
-    centred, (src_origin, dst_origin) = solution.pose, origins
-    translation = dst_origin + centred.translation - centred.scale * centred.rotation @ src_origin
-    pose = Pose(centred.rotation, translation, np.asarray(centred.scale))
-    selection = _first_rows(solution.selection, n, m)
-    solution = replace(solution, pose=pose, selection=selection, inliers=selection.inliers)
+    solution = without_padding(with_origins(solution, *origins), problem)
+    pose, selection = solution.pose, solution.selection
     # A certificate may be asked for later, when the caller's arrays hold something else.
     kept = jax.tree.map(np.array, problem)
     return Registration(pose, selection.inliers, Status(int(solution.status)), solution, kept)
 
 
-def _first_rows(selection: Selection, n: int, m: int | None) -> Selection:
+def with_origins(solution: Solution, src_origin: np.ndarray, dst_origin: np.ndarray) -> Solution:
+    """The solution of centred clouds (or of a stack of them) in the frames that these came from."""
+    pose = solution.pose
+    turned = so3.rotate(pose.rotation, src_origin[..., None, :])[..., 0, :]
+    translation = dst_origin + pose.translation - pose.scale[..., None] * turned
+    return replace(solution, pose=Pose(pose.rotation, translation, np.asarray(pose.scale)))
+
+
+def without_padding(solution: Solution, problem: Problem) -> Solution:
+    """The solution in the rows of its problem, or of a stack of them; padding came last."""
+    n = problem.src.shape[-2]
+    m = n if problem.pairs is None else problem.pairs.shape[-2]
+    chosen = solution.selection
+
     def cut(pair_set: Any) -> Any:
         if pair_set is None:
             return None
-        if pair_set.dtype == np.uint32:  # padding came last, so the words of the first n stay as they are
-            return pair_set[:n, : words(n)]
-        return pair_set[: n if m is None else m]
+        if pair_set.dtype == np.uint32:  # the words of the first n stay as they are
+            return pair_set[..., :n, : words(n)]
+        return pair_set[..., :m]
 
-    return replace(
-        selection,
-        scale_pairs=cut(selection.scale_pairs),
-        clique=selection.clique[:n],
-        rotation=cut(selection.rotation),
-        translation=selection.translation[:n],
-        inliers=selection.inliers[:n],
+    selection = replace(
+        chosen,
+        scale_pairs=cut(chosen.scale_pairs),
+        clique=chosen.clique[..., :n],
+        rotation=cut(chosen.rotation),
+        translation=chosen.translation[..., :n, :],
+        inliers=chosen.inliers[..., :n],
     )
+    return replace(solution, selection=selection, inliers=selection.inliers)

@@ -58,13 +58,32 @@ def axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def _unit(vector: Float[Array, "3"], fallback: Float[Array, "3"]) -> Float[Array, "3"]:
-    norm2 = jnp.sum(vector * vector)
+    norm2 = _inner(vector, vector)
     safe = norm2 > jnp.finfo(vector.dtype).tiny
     return jnp.where(safe, vector * lax.rsqrt(jnp.where(safe, norm2, 1.0)), fallback)
 
 
+def times(a: Array, b: Array) -> Array:
+    """The product, rounded before anything is added to it.
+
+    Compilers fuse a product and a sum where their vectors happen to allow it, so that the last bit
+    would depend on the place in a batch. A comparison between the two prevents that; a reduction of
+    precision to what it is already, a barrier and a cast to bits are all optimised away.
+
+    Gradients: exact.
+    """
+    product = a * b
+    return jnp.maximum(product, jnp.finfo(product.dtype).min)
+
+
+def _inner(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
+    products = times(a, b)
+    return products[0] + products[1] + products[2]
+
+
 def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    i, j = ((1, 2), (2, 0), (0, 1)), ((2, 1), (0, 2), (1, 0))
+    return jnp.stack([times(a[p], b[q]) - times(a[r], b[s]) for (p, q), (r, s) in zip(i, j, strict=True)])
 
 
 def singular_frames(
@@ -125,20 +144,20 @@ def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
 
     def turn(_: int, rows: Array) -> Array:  # row k holds column k of A and of V: both turn alike
         x, y = rows[0], rows[1]
-        xx, yy, xy = jnp.sum(x[:3] ** 2), jnp.sum(y[:3] ** 2), jnp.sum(x[:3] * y[:3])
+        xx, yy, xy = (_inner(u[:3], v[:3]) for u, v in ((x, x), (y, y), (x, y)))
         done = jnp.abs(xy) <= 8 * tiny
         zeta = (yy - xx) / (2 * jnp.where(done, 1, xy))
-        tangent = jnp.where(zeta >= 0, 1, -1) / (jnp.abs(zeta) + jnp.sqrt(1 + zeta * zeta))
+        tangent = jnp.where(zeta >= 0, 1, -1) / (jnp.abs(zeta) + jnp.sqrt(1 + times(zeta, zeta)))
         tangent = jnp.where(done, 0, tangent)
-        cosine = lax.rsqrt(1 + tangent * tangent)
+        cosine = lax.rsqrt(1 + times(tangent, tangent))
         sine = cosine * tangent
-        return jnp.stack([sine * x + cosine * y, rows[2], cosine * x - sine * y])
+        turned = times(sine, x) + times(cosine, y), times(cosine, x) - times(sine, y)
+        return jnp.stack([turned[0], rows[2], turned[1]])
 
     start = jnp.concatenate([(matrix / jnp.where(size > 0, size, 1)).T, eye], axis=1)
     rows = lax.fori_loop(0, 3 * JACOBI_SWEEPS, turn, start)
-    norms = jnp.sum(rows[:, :3] ** 2, axis=1)
     # Written out: argmax is lowered after the block that allows float64, and would lose half of its digits.
-    x, y, z = norms
+    x, y, z = (_inner(row[:3], row[:3]) for row in rows)
     zero, one, two = jnp.int32(0), jnp.int32(1), jnp.int32(2)
     first = jnp.where((x >= y) & (x >= z), zero, jnp.where(y >= z, one, two))
     third = jnp.where((z <= x) & (z <= y), two, jnp.where(y <= x, one, zero))  # never `first`
@@ -152,7 +171,7 @@ def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
 
 
 def _reject(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, "3"]:
-    return vector - jnp.sum(vector * axis) * axis
+    return vector - times(_inner(vector, axis), axis)
 
 
 def largest_eigenvalue(matrix: Float[Array, "3 3"]) -> Float[Array, ""]:
@@ -183,8 +202,8 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     References: Yang, Shi, Carlone, T-RO 2020, eq. (12) without truncation; Horn 1987.
     """
     left, right = _leading_axes(matrix)
-    third = _cross(left[0], left[1])[:, None] * _cross(right[0], right[1])
-    return left[0][:, None] * right[0] + left[1][:, None] * right[1] + third
+    third = times(_cross(left[0], left[1])[:, None], _cross(right[0], right[1]))
+    return times(left[0][:, None], right[0]) + times(left[1][:, None], right[1]) + third
 
 
 @nearest_rotation.defjvp

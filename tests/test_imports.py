@@ -26,6 +26,7 @@ ORDER = [
     "certify.relaxation",
     "certify.pose", "certify.error_bounds", "certify.verify", "wahba",
     "packing", "summary", "register", "profile",
+    "batch.groups", "batch.programs", "batch.processes", "batch.run",
     "metrics", "synthetic.models", "synthetic.protocol", "synthetic.solids", "synthetic.scans",
     "learn.matching", "learn.losses", "learn.teacher", "learn.network", "learn.training",
     "files", "plots.stages", "plots.proofs", "plots.learning", "cli",

@@ -10,12 +10,13 @@ README = Path(__file__).parents[1] / "README.md"
 
 def test_the_examples_run(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     names: dict = {}
     for block in blocks:
         exec(block, names)
     assert names["result"].ok
     assert names["batch"].ok.all()
+    assert names["stacked"].ok.mean() > 0.9
     assert names["certificate"].is_optimal
     said = capsys.readouterr().out
     assert "ok: OK" in said

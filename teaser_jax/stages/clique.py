@@ -161,7 +161,7 @@ def maximum_clique(
     found = clique_on_device(edge_bits, mask, method=method)
     if method in ("none", "greedy") or mask.shape[0] == 0:
         return found
-    search = partial(_search_batch, method=method, nodes=nodes, seconds=seconds)
+    search = partial(search_batch_on_host, method=method, nodes=nodes, seconds=seconds)
     shapes = Clique(jax.ShapeDtypeStruct(mask.shape, jnp.bool_), jax.ShapeDtypeStruct((), jnp.int32))
 
     def ask_host() -> Clique:
@@ -193,14 +193,25 @@ def search_on_host(
     return Clique(members, np.int32(upper))
 
 
-def _search_batch(edge_bits, mask, members, upper, *, method, nodes, seconds):
-    edge_bits, mask, members, upper = (np.asarray(x) for x in (edge_bits, mask, members, upper))
-    out = Clique(np.array(members), np.array(upper, dtype=np.int32))
-    for item in np.ndindex(upper.shape):
+def search_batch_on_host(
+    edge_bits: np.ndarray,
+    mask: np.ndarray,
+    members: np.ndarray,
+    upper_bound: np.ndarray,
+    *,
+    method: str,
+    nodes: int,
+    seconds: float,
+) -> Clique:
+    """``search_on_host`` for whatever batch axes stand in front, one graph after the other."""
+    out = Clique(np.array(members), np.array(upper_bound, dtype=np.int32))
+    edge_bits, mask = np.asarray(edge_bits), np.asarray(mask)
+    unproved = (out.members.sum(axis=-1) < out.upper_bound) | (method == "networkx")
+    for item in map(tuple, np.argwhere(unproved)):
         one = search_on_host(
             edge_bits[item],
             mask[item],
-            Clique(members[item], upper[item]),
+            Clique(out.members[item], out.upper_bound[item]),
             method=method,
             nodes=nodes,
             seconds=seconds,

@@ -1,0 +1,1 @@
+"""Many problems on all devices there are."""

@@ -1,0 +1,147 @@
+"""Problems of all sizes, sorted into groups that share a compiled program."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from teaser_jax.packing import PackedProblem, pack_problem
+from teaser_jax.problem import is_traced
+from teaser_jax.register import bucket, float32_will_do, median
+from teaser_jax.types import Problem, Settings
+
+FLOATS = ("src", "dst", "noise_bound", "cbar2", "confidence", "scale")
+
+Origins = tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3"]]
+
+
+class Size(NamedTuple):
+    """What a program is compiled for: padded matches and pairs, and whether the scale is known."""
+
+    n: int
+    m: int | None
+    scale_is_known: bool
+
+
+def read_list(problems: Sequence[Problem]) -> list[Problem]:
+    """The problems in float64 numpy, each checked. Raises ValueError with the number of the bad one."""
+    return [_read(problem, 1, f"problems[{k}]") for k, problem in enumerate(problems)]
+
+
+def read_stack(stack: Problem) -> Problem:
+    """A stacked problem in float64 numpy. Raises ValueError if its arrays do not belong together."""
+    return _read(stack, 2, "the stacked problem")
+
+
+def _read(problem: Any, axes: int, name: str) -> Problem:
+    if not isinstance(problem, Problem):
+        raise ValueError(
+            f"{name} is of type {type(problem).__name__}: expected a Problem, as from make_problem."
+        )
+    if is_traced(*jax.tree.leaves(problem)):
+        raise ValueError(
+            "solve_batch was called inside jit, vmap or grad: use jax.vmap(teaser_jax.solve) there."
+        )
+
+    as_array: Any = np.asarray  # of its many signatures none is that of a field
+    given = {field: getattr(problem, field) for field in FLOATS}
+    floats: dict[str, Any] = {k: None if x is None else as_array(x, np.float64) for k, x in given.items()}
+    read = Problem(
+        **floats,
+        mask=as_array(problem.mask, bool),
+        pairs=None if problem.pairs is None else as_array(problem.pairs),
+    )
+    if read.src.ndim != axes + 1:
+        usual = "(n, 3); a stack goes in by itself, not in a list" if axes == 1 else "(b, n, 3)"
+        raise ValueError(f"{name} has src of shape {read.src.shape}: expected {usual}.")
+    rows, front = read.src.shape[:-1], read.src.shape[: axes - 1]
+    expected = {
+        "src": (*rows, 3), "dst": (*rows, 3), "noise_bound": rows, "mask": rows, "confidence": rows,
+        "cbar2": front, "scale": front,
+        "pairs": (*front, *getattr(read.pairs, "shape", ())[axes - 1 : axes], 2),
+    }  # fmt: skip
+    for field, shape in expected.items():
+        value = getattr(read, field)
+        if value is not None and value.shape != shape:
+            raise ValueError(f"{name} has {field} of shape {value.shape}: expected {shape}.")
+    pairs = read.pairs
+    if pairs is not None and pairs.size and not 0 <= pairs.min() <= pairs.max() < rows[-1]:
+        raise ValueError(f"{name} has pairs of rows that do not exist: rows run from 0 to {rows[-1] - 1}.")
+    return read
+
+
+def size_of(problem: Problem) -> Size:
+    """The group of one problem, or of a stack."""
+    m = None if problem.pairs is None else bucket(problem.pairs.shape[-2])
+    return Size(bucket(problem.src.shape[-2]), m, problem.scale is not None)
+
+
+def by_size(problems: Sequence[Problem]) -> dict[Size, Int[np.ndarray, " b"]]:
+    """The places of the problems of each size, in the user's order."""
+    places: dict[Size, list[int]] = {}
+    for k, problem in enumerate(problems):
+        places.setdefault(size_of(problem), []).append(k)
+    return {size: np.array(each) for size, each in places.items()}
+
+
+def pack_list(problems: Sequence[Problem], settings: Settings, size: Size) -> PackedProblem:
+    """Problems of one size as one batch on the host."""
+    packed = [pack_problem(problem, settings, size.n, size.m) for problem in problems]
+    pairs = None if size.m is None else np.stack([np.asarray(each.pairs) for each in packed])
+    return PackedProblem(
+        np.stack([each.columns for each in packed]), np.stack([each.numbers for each in packed]), pairs
+    )
+
+
+class Ready(NamedTuple):
+    """A batch in the frames in which it will be solved."""
+
+    sent: PackedProblem
+    origins: Origins | None  # taken away from the points; None: nothing was
+    narrow: Bool[np.ndarray, " b"]  # whose edges float32 can test
+
+
+def centred(sent: PackedProblem) -> Ready:
+    """Points are moved to their middle where float32 could not tell consistent matches otherwise.
+
+    Most batches of a study need nothing, and finding the middle takes a quarter of the time of solving
+    a small problem.
+    """
+    narrow = _float32_will_do(sent)
+    if narrow.all():
+        return Ready(sent, None, narrow)
+    columns = sent.columns.copy()
+    origins = np.zeros((len(columns), 3)), np.zeros((len(columns), 3))
+    for k in np.flatnonzero(~narrow):
+        usable = _usable(columns[k])
+        for origin, rows in zip(origins, (slice(0, 3), slice(3, 6)), strict=True):
+            if usable.any():
+                origin[k] = median(columns[k, rows, usable])
+                columns[k, rows] -= origin[k][:, None]
+    sent = sent._replace(columns=columns)
+    return Ready(sent, origins, _float32_will_do(sent))
+
+
+def _usable(columns: Float[np.ndarray, "*b 9 n"]) -> Bool[np.ndarray, "*b n"]:
+    """Rows of numbers that the mask admits."""
+    return (columns[..., 8, :] > 0) & np.isfinite(columns[..., :7, :]).all(axis=-2)
+
+
+def _float32_will_do(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
+    """Of each problem, whether its edges may be tested in float32 where it lies."""
+    columns, numbers = sent.columns, sent.numbers
+    if numbers.shape[-1] < 6:  # a voted scale keeps all digits
+        return np.zeros(len(columns), bool)
+    usable = _usable(columns)
+
+    def extent(points: np.ndarray) -> np.ndarray:
+        return np.abs(np.where(usable[:, None], points, 0)).max(axis=(1, 2), initial=0)
+
+    with np.errstate(invalid="ignore", over="ignore"):  # numbers that make no sense: a status will say so
+        reach = np.sqrt(3) * (numbers[:, 5] * extent(columns[:, :3]) + extent(columns[:, 3:6]))
+        bound = np.sqrt(numbers[:, 0]) * np.where(usable, columns[:, 6], np.inf).min(axis=1, initial=np.inf)
+        return float32_will_do(reach, bound)

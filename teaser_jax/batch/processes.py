@@ -1,0 +1,41 @@
+"""A batch over several processes: each solves its share, and all receive everything."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh
+
+from teaser_jax.batch.programs import AXIS
+
+
+def local_mesh(mesh: Mesh | None) -> Mesh | None:
+    """The devices of this process as one axis, of a mesh or of all there are; None: it has none there."""
+    devices = list(jax.devices() if mesh is None else mesh.devices.flat)
+    mine = [d for d in devices if d.process_index == jax.process_index()]
+    return Mesh(np.array(mine), (AXIS,), axis_types=(AxisType.Auto,)) if mine else None
+
+
+def share(count: int, mesh: Mesh | None) -> slice:
+    """Which of so many problems this process solves: a piece in proportion to its devices."""
+    devices = list(jax.devices() if mesh is None else mesh.devices.flat)
+    before = sum(d.process_index < jax.process_index() for d in devices)
+    mine = sum(d.process_index == jax.process_index() for d in devices)
+    return slice(count * before // len(devices), count * (before + mine) // len(devices))
+
+
+def all_of(mine: Any) -> list[Any]:
+    """What every process has, in their order. All of them must call it."""
+    if jax.process_count() == 1:
+        return [mine]
+    from jax.experimental.multihost_utils import process_allgather
+
+    said = np.frombuffer(pickle.dumps(mine), np.uint8)
+    lengths = process_allgather(np.array([len(said)], np.int32)).reshape(-1)
+    padded = np.zeros(lengths.max(), np.uint8)
+    padded[: len(said)] = said
+    gathered = process_allgather(padded).reshape(len(lengths), -1)
+    return [pickle.loads(each[:n].tobytes()) for each, n in zip(gathered, lengths, strict=True)]
