@@ -153,7 +153,7 @@ def _solved(problem: Problem, settings: Settings, dtype: type) -> Solution:
     """Device, host, device; edges are tested in ``dtype``."""
     sent = pack_problem(problem, settings, *buckets(problem))
     with jax.enable_x64(True):
-        graph, found, proved = _before(sent, choices_of(settings), dtype)
+        graph, found, proved = before_clique(sent, choices_of(settings), dtype)
         clique = between(sent, graph, found, proved, settings)
         return concluded(sent, graph, clique, settings)
 
@@ -282,7 +282,7 @@ def float32_will_do(reach: Any, bound: Any) -> Any:
     return in_range & (rounding(np.float32, reach) <= 1e-3 * bound)
 
 
-def before_clique(sent: PackedProblem, choices: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
+def until_clique(sent: PackedProblem, choices: Settings, dtype: type) -> tuple[Graph, Clique, Array]:
     """Device program one: scale, graph, and the clique as far as the device takes it; is it proved?"""
     problem, settings = unpack_problem(sent, choices)
     graph = prepare(problem, settings, edge_dtype=dtype)
@@ -307,14 +307,14 @@ def between(
     )  # fmt: skip
 
 
-def after_clique(sent: PackedProblem, graph: Graph, clique: Clique, choices: Settings) -> PackedSolution:
+def since_clique(sent: PackedProblem, graph: Graph, clique: Clique, choices: Settings) -> PackedSolution:
     """Device program two: the sets, the pose, the verdict."""
     problem, settings = unpack_problem(sent, choices)
     return pack_solution(conclude(problem, graph, clique, settings))
 
 
-_before = jax.jit(before_clique, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)
-_after = jax.jit(after_clique, compiler_options=WHOLE_SUMS | OLDER_EMITTERS)
+before_clique = jax.jit(until_clique, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)
+after_clique = jax.jit(since_clique, compiler_options=WHOLE_SUMS | OLDER_EMITTERS)
 
 
 def concluded(sent: PackedProblem, graph: Graph, clique: Clique, settings: Settings) -> Solution:
@@ -322,7 +322,7 @@ def concluded(sent: PackedProblem, graph: Graph, clique: Clique, settings: Setti
     if settings.rotation == "sdp":
         problem, settings = unpack_problem(sent, settings)
         return jax.device_get(conclude(problem, graph, clique, settings))
-    return unpack_solution(fetched(_after(sent, graph, clique, choices_of(settings))))
+    return unpack_solution(fetched(after_clique(sent, graph, clique, choices_of(settings))))
 
 
 def registration_of(

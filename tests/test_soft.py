@@ -48,7 +48,9 @@ def both_ways(problem, gnc_mu, direction, cotangent):
     return along(direction), jax.linear_transpose(along, inputs)(cotangent)[0]
 
 
-@pytest.mark.parametrize("scale", [1.3, None], ids=["known", "unknown"])
+@pytest.mark.parametrize(
+    "scale", [pytest.param(1.3, id="known"), pytest.param(None, id="unknown", marks=pytest.mark.slow)]
+)
 def test_forward_reverse_and_central_differences_agree(scale, x64):
     rng = np.random.default_rng(0)
     problem, mu = blurred(11, scale=scale), 1.0
@@ -191,6 +193,7 @@ def test_single_precision_follows_double():
     assert soften(problem, 1.0).ok
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_iterations():
     problem = blurred(11, scale=1.3)
 

@@ -13,7 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from teaser_jax.batch.groups import Size
 from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.packing import PackedProblem
-from teaser_jax.register import after_clique, before_clique
+from teaser_jax.register import since_clique, until_clique
 from teaser_jax.types import Settings
 
 AXIS = "problems"
@@ -53,10 +53,10 @@ def programs(choices: Settings, mesh: Mesh) -> Programs:
 
     def before(sent: PackedProblem, narrow: bool) -> Any:
         dtype = np.float32 if narrow else np.float64
-        return sharded(lambda one: before_clique(one, choices, dtype))(sent)
+        return sharded(lambda one: until_clique(one, choices, dtype))(sent)
 
     def after(sent: PackedProblem, graph: Any, clique: Any) -> Any:
-        return sharded(lambda s, g, c: after_clique(s, g, c, choices))(sent, graph, clique)
+        return sharded(lambda s, g, c: since_clique(s, g, c, choices))(sent, graph, clique)
 
     on_cpu = mesh.devices.flat[0].platform == "cpu"
     options = (WHOLE_SUMS | WIDE_VECTORS, WHOLE_SUMS | OLDER_EMITTERS) if on_cpu else ({}, {})
