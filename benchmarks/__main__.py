@@ -10,6 +10,7 @@ from pathlib import Path
 from benchmarks import (
     accuracy,
     baseline,
+    batch,
     certificate,
     clique,
     cold,
@@ -31,6 +32,7 @@ BENCHMARKS = {
     "cold": cold,
     "growth": growth,
     "certificate": certificate,
+    "batch": batch,
     "gradients": gradients,
     "learning": learning,
 }

@@ -1,0 +1,144 @@
+"""Many problems at once: throughput beside a loop over ``register`` and beside two processes of a peer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
+import jax
+import numpy as np
+
+import teaser_jax as tj
+from benchmarks.baseline import Metric, said
+from benchmarks.peers import PEERS
+from benchmarks.problems import Case, protocol
+
+# Matches, problems, what was wanted [problems/s] (None: three times the loop).
+CELLS = ((50, 1024, 45_000), (100, 1024, 14_000), (1000, 64, None))
+RATES = {50: (0.5, 0.8, 0.9), 100: (0.5, 0.8, 0.9), 1000: (0.95,)}
+PEER, PEER_PROCESSES = "kiss-matcher", 2
+
+
+def seconds(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median times of works that take turns; each has run before."""
+    taken: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(rounds):
+        for name, work in works.items():
+            start = time.perf_counter()
+            work()
+            taken[name].append(time.perf_counter() - start)
+    return {name: float(np.median(times)) for name, times in taken.items()}
+
+
+def right(cases: list[Case], poses: list[tj.Pose]) -> float:
+    """Share of accepted answers."""
+    return float(np.mean([case.is_right(pose) for case, pose in zip(cases, poses, strict=True)]))
+
+
+def by_peer(cases: list[Case]) -> list[tj.Pose]:
+    """A share of the problems, in one process."""
+    return [PEERS[PEER].solve(case) for case in cases]
+
+
+def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, pool: Any) -> dict:
+    """One size and share of wrong matches."""
+    cases = list(protocol(n, rate, count))
+    problems = [tj.host_problem(c.src, c.dst, noise_bound=c.noise_bound) for c in cases]
+    stack = tj.stack_problems(problems)
+    some = cases[:: max(1, count // 64)]
+
+    def loop() -> list[tj.Registration]:
+        return [tj.register(c.src, c.dst, noise_bound=c.noise_bound) for c in some]
+
+    start = time.perf_counter()
+    batch = tj.solve_batch(stack)
+    cold = time.perf_counter() - start
+    alone = loop()
+    works: dict[str, Callable[[], Any]] = {
+        "stack": lambda: tj.solve_batch(stack),
+        "list": lambda: tj.solve_batch(problems),
+        "loop": loop,
+    }
+    row: dict[str, Any] = {"cell": cases[0].cell, "batch": count, "wanted": wanted, "cold": cold}
+    if pool is not None:
+        shares = [cases[k::PEER_PROCESSES] for k in range(PEER_PROCESSES)]
+        answers = list(pool.map(by_peer, shares))
+        poses = [answers[k % PEER_PROCESSES][k // PEER_PROCESSES] for k in range(count)]
+        row["right_peer"] = right(cases, poses)
+        works["peer"] = lambda: list(pool.map(by_peer, shares))
+    taken = seconds(works, rounds)
+    sizes = {"loop": len(some)}
+    row["rates"] = {name: sizes.get(name, count) / taken[name] for name in works}
+    each = [jax.tree.map(lambda x, k=k: x[k], batch.pose) for k in range(count)]
+    row["right"], row["right_loop"] = right(cases, each), right(some, [a.pose for a in alone])
+    row["proved"] = float(np.mean(batch.clique_is_maximum))
+    row["proved_on_device"] = float(np.mean(proved_on_device(stack)))
+    return row
+
+
+def proved_on_device(stack: tj.Problem) -> np.ndarray:
+    """Which cliques the device proves by itself, before the host's turn."""
+    from teaser_jax.packing import choices_of, pack_problem
+    from teaser_jax.register import bucket, until_clique
+
+    settings = tj.Settings()
+    with jax.enable_x64(True):
+        sent = pack_problem(stack, settings, bucket(stack.src.shape[1]), None)
+        one = jax.jit(lambda x: until_clique(x, choices_of(settings), np.float32)[2])
+        return np.asarray(jax.lax.map(one, sent, batch_size=64))
+
+
+def run(quick: bool) -> list[dict]:
+    """A row a cell; the peer's processes are started once."""
+    rows = []
+    # Started afresh: a process that has threads must not be forked.
+    pool = ProcessPoolExecutor(PEER_PROCESSES, get_context("spawn")) if PEER in PEERS else None
+    try:
+        for n, count, wanted in CELLS:
+            for rate in RATES[n]:
+                share, rounds = (8, 2) if quick else (1, 9)
+                rows.append(cell(n, rate, count // share, wanted, rounds, pool))
+    finally:
+        if pool is not None:
+            pool.shutdown()
+    return rows
+
+
+def metrics(rows: list[dict]) -> list[Metric]:
+    """Throughput, and success."""
+    found = []
+    for r in rows:
+        found.append(
+            Metric(f"{r['cell']}: batch", r["rates"]["stack"], "problems/s", "higher", 0.4, portable=False)
+        )
+        ratio = r["rates"]["stack"] / r["rates"]["loop"]
+        found.append(Metric(f"{r['cell']}: against a loop", ratio, "times", "higher", 0.4))
+        found.append(Metric(f"{r['cell']}: right", r["right"], "share", "higher", 0.01))
+    return found
+
+
+def report(rows: list[dict]) -> str:
+    """A line a cell."""
+    text = [
+        "Problems a second, warm: `solve_batch` of a stack and of a list, a loop over `register`, and "
+        f"{PEER} in {PEER_PROCESSES} processes, on the same problems, taking turns.",
+        "",
+        f"| cell | batch | stack | list | loop | {PEER} | wanted | reached | right: ours, loop, peer "
+        "| proved on the device | first call [s] |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        rates = r["rates"]
+        wanted = r["wanted"] or 3 * rates["loop"]
+        peer = f"{rates['peer']:.0f}" if "peer" in rates else "-"
+        peer_right = f"{r['right_peer']:.1%}" if "right_peer" in r else "-"
+        text.append(
+            f"| {r['cell']} | {r['batch']} | {rates['stack']:.0f} | {rates['list']:.0f} "
+            f"| {rates['loop']:.0f} | {peer} | {wanted:.0f} | {said(rates['stack'] >= wanted)} "
+            f"| {r['right']:.1%}, {r['right_loop']:.1%}, {peer_right} | {r['proved_on_device']:.1%} "
+            f"| {r['cold']:.1f} |"
+        )
+    return "\n".join(text)
