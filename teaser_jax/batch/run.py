@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Int
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from teaser_jax.batch.groups import Size, by_size, centred, pack_list, read_list, read_stack, size_of
 from teaser_jax.batch.processes import all_of, local_mesh, share
