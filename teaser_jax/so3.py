@@ -82,8 +82,7 @@ def _inner(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
 
 
 def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    i, j = ((1, 2), (2, 0), (0, 1)), ((2, 1), (0, 2), (1, 0))
-    return jnp.stack([times(a[p], b[q]) - times(a[r], b[s]) for (p, q), (r, s) in zip(i, j, strict=True)])
+    return jnp.stack([times(a[i], b[j]) - times(a[j], b[i]) for i, j in ((1, 2), (2, 0), (0, 1))])
 
 
 def singular_frames(

@@ -187,17 +187,17 @@ class Solver:
             of_kind = order[ready.narrow[order] == narrow]
             for k in range(0, len(of_kind), length):
                 some = of_kind[k : k + length]
-                answers.append((some, self._run(jax.tree.map(lambda x, i=some: x[i], ready.sent), narrow)))
+                answers.append(
+                    (some, self._run(jax.tree.map(lambda x, i=some: x[i], ready.sent), narrow, length))
+                )
         places = np.concatenate([some for some, _ in answers])
         back = np.argsort(places)
         solution = jax.tree.map(lambda *x: np.concatenate(x)[back], *[answer for _, answer in answers])
         return solution if ready.origins is None else with_origins(solution, *ready.origins)
 
-    def _run(self, sent: PackedProblem, narrow: bool) -> Solution:
+    def _run(self, sent: PackedProblem, narrow: bool, length: int) -> Solution:
         """One run of both programs, with the host's search between them where a clique has no proof."""
-        count, size = len(sent.columns), sent.columns.shape[-1]
-        settings = self.settings
-        length = self.run_length(Size(size, None if sent.pairs is None else sent.pairs.shape[-2], True))
+        count, settings = len(sent.columns), self.settings
         sent = jax.tree.map(lambda x: _repeated(x, length), sent)
         sent.columns[count:, 8] = 0  # what fills the run is masked
         compiled = programs(choices_of(settings), self.mesh)
