@@ -23,7 +23,7 @@ from teaser_jax import Settings, learn, register, synthetic
 from teaser_jax import metrics as pose_metrics
 
 SEEDS = 3
-STEPS = 550
+STEPS = 500
 NOISE_BOUND = 0.05
 TURN = (20.0, 50.0)  # between the two views [deg]
 LARGEST_ANGLE, LARGEST_DISTANCE = 5.0, 0.05  # of an answer that is right [deg], [1]
