@@ -1,6 +1,6 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
 
-from teaser_jax import files, learn, metrics, plots, so3, synthetic
+from teaser_jax import files, learn, metrics, plots, so3, studies, synthetic
 from teaser_jax.batch.run import solve_batch
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
 from teaser_jax.certify.error_bounds import ErrorBounds, error_bounds
@@ -23,6 +23,6 @@ __all__ = [
     "Registration", "RotationSolution", "Selection", "Settings", "SoftSolution", "Solution", "Status",
     "Uncertainty", "certify", "certify_rotation", "covariance", "error_bounds", "files", "host_problem",
     "learn", "make_problem", "metrics", "plots", "pose_difference", "profile", "refit", "register", "select",
-    "so3", "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "synthetic", "verify",
-    "warmup",
+    "so3", "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic",
+    "verify", "warmup",
 ]  # fmt: skip

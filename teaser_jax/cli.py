@@ -1,4 +1,4 @@
-"""The command line: ``teaser-jax register MATCHES`` and ``teaser-jax demo``.
+"""The command line: ``teaser-jax register MATCHES``, ``teaser-jax demo`` and ``teaser-jax study NAME``.
 
 Exit codes: 0, the answer can be trusted; 1, there is no trustworthy answer and the status says
 why; 2, bad input, with one line on stderr that says what is wrong and what to do. With 2 no file
@@ -23,6 +23,7 @@ import numpy as np
 
 import teaser_jax as tj
 from teaser_jax.files import KNOWN, FileError, Matches, one_line, read_matches, whole, write_pose
+from teaser_jax.studies import StudyError, command
 
 OK, UNTRUSTED, BAD_INPUT = 0, 1, 2
 PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")  # what matplotlib writes without further programs
@@ -117,6 +118,10 @@ def _parser() -> argparse.ArgumentParser:
         "--plot", type=_picture, default=Path("demo.png"), metavar="PNG", help="default: demo.png"
     )
     demo.add_argument("--seed", type=_seed, default=0, help="default: 0")
+
+    study = commands.add_parser("study", help="run the paper's studies: tables and figures of many problems")
+    study.set_defaults(run=_study)
+    command.add_arguments(study)
     return parser
 
 
@@ -231,6 +236,13 @@ def _demo(arguments: argparse.Namespace) -> int:
             _draw(partial, problem.src, problem.dst, result)
         print(f"Picture: {arguments.plot}")
     return OK if result.ok else UNTRUSTED
+
+
+def _study(arguments: argparse.Namespace) -> int:
+    try:
+        return command.run(arguments)
+    except (StudyError, ImportError) as error:
+        raise BadInput(str(error)) from error
 
 
 def _errors(pose: tj.Pose, truth: tj.Pose, name: str) -> str:

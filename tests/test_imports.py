@@ -29,7 +29,10 @@ ORDER = [
     "batch.groups", "batch.programs", "batch.processes", "batch.run",
     "metrics", "synthetic.models", "synthetic.protocol", "synthetic.solids", "synthetic.scans",
     "learn.matching", "learn.losses", "learn.teacher", "learn.network", "learn.training",
-    "files", "plots.stages", "plots.proofs", "plots.learning", "cli",
+    "files", "plots.stages", "plots.proofs", "plots.learning",
+    "studies.peers", "studies.trials", "studies.methods", "studies.catalogue", "studies.shards",
+    "studies.table", "studies.results", "studies.figures", "studies.run", "studies.claims", "studies.paper",
+    "studies.command", "cli",
 ]  # fmt: skip
 # The search returns to the module that calls it for one thing: networkx, where numba cannot be had. The
 # summary names the type of what it is about, for type checkers only.

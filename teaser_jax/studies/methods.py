@@ -1,0 +1,310 @@
+"""The methods of the studies: each takes problems of one size and answers with rows of numbers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from teaser_jax import metrics
+from teaser_jax.batch.run import solve_batch
+from teaser_jax.certify.proof import CertifyMethod
+from teaser_jax.certify.rotation import certify_rotation
+from teaser_jax.profile import profile
+from teaser_jax.register import register
+from teaser_jax.stages.refinement import fit_similarity
+from teaser_jax.stages.scale import estimate_scale
+from teaser_jax.stages.translation import estimate_translation
+from teaser_jax.studies.peers import Peer
+from teaser_jax.studies.trials import Trial
+from teaser_jax.types import CliqueMethod, Criterion, Pose, RotationMethod, Settings, Solution, Status
+from teaser_jax.wahba import solve_rotation
+
+Row: TypeAlias = dict[str, Any]
+OURS = "teaser_jax"
+LIMIT = "least squares on the true inliers"
+SDP_MOST = 21  # right matches whose chain the semidefinite relaxation takes in some seconds
+STAGES = {
+    "scale": "stage_scale", "consistency graph": "stage_graph", "clique, device": "stage_clique",
+    "clique, host": "stage_clique", "rotation": "stage_rotation", "translation": "stage_translation",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Method:
+    """One curve of a figure.
+
+    Attributes:
+        name: In table and legend.
+        run: Answers trials of one size, a row of measures each.
+        together: It takes all trials of a cell at once, and every process must call it; otherwise they
+            come one by one, so that each is saved as soon as it is there.
+        suits: Whether it can be asked; cells whose first trial does not suit are left out.
+        slow: Takes seconds a problem and more: not part of a quick study.
+        others: Not ours: what it raises is noted in the row and does not end the study.
+    """
+
+    name: str
+    run: Callable[[list[Trial], Mesh | None], list[Row]]
+    together: bool = False
+    suits: Callable[[Trial], bool] = lambda trial: True
+    slow: bool = False
+    others: bool = False
+
+
+def in_batches(name: str = OURS, **chosen: Any) -> Method:
+    """``solve_batch`` on all trials of a cell, with some settings; the time is a share of the batch's."""
+    settings = Settings(**chosen)
+    return Method(name, partial(_in_batches, settings=settings), together=True)
+
+
+def one_by_one(name: str, *, suits: Callable[[Trial], bool] | None = None, **chosen: Any) -> Method:
+    """``register`` on each trial, warm."""
+    settings, warm = Settings(**chosen), _Once()
+
+    def solve(trial: Trial) -> Solution:
+        p = trial.problem
+        return register(
+            p.src, p.dst, noise_bound=p.noise_bound, scale=trial.scale, settings=settings
+        ).solution
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        for trial in trials:
+            if settings.rotation != "sdp":
+                warm(len(trial.problem.src), partial(solve, trial))
+            with _timed() as clock:
+                found = solve(trial)
+            rows.append(_judged(trial, found) | clock)
+        return rows
+
+    return Method(name, run, suits=suits or (lambda trial: True), slow=settings.rotation == "sdp")
+
+
+def few_right(trial: Trial) -> bool:
+    """Whether the semidefinite relaxation can take the clique of a trial."""
+    return bool(trial.problem.inliers.sum() <= SDP_MOST)
+
+
+def stage_by_stage() -> Method:
+    """``profile``: the answer of ``register`` and the seconds of every stage."""
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        for trial in trials:
+            p = trial.problem
+            found = profile(p.src, p.dst, repeats=1, noise_bound=p.noise_bound, scale=trial.scale)
+            row = _judged(trial, found.result.solution) | {"seconds": sum(found.warm.values())}
+            for stage, seconds in found.warm.items():
+                column = STAGES.get(stage, "stage_rest")
+                row[column] = row.get(column, 0.0) + seconds
+            rows.append(row)
+        return rows
+
+    return Method(f"{OURS}, stage by stage", run)
+
+
+def limit() -> Method:
+    """The fit to the true inliers, which no method can beat but by luck."""
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        with jax.enable_x64(True):
+            for trial in trials:
+                p = trial.problem
+                pose = jax.device_get(_fit(p.src, p.dst, p.inliers.astype(float), trial.scale).pose)
+                rows.append(errors(trial, pose))
+        return rows
+
+    return Method(LIMIT, run)
+
+
+def of_peer(name: str, peer: Peer) -> Method:
+    """Another library; asked only what it can answer."""
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        for trial in trials:
+            p = trial.problem
+            with _timed() as clock:
+                pose = peer.solve(p.src, p.dst, p.noise_bound, trial.scale)
+            rows.append(errors(trial, pose) | clock)
+        return rows
+
+    suits = lambda trial: peer.finds_scale or trial.scale is not None
+    return Method(name, run, suits=suits, slow=name.endswith("RANSAC-60s"), others=True)
+
+
+def scale_by_vote(criterion: Criterion) -> Method:
+    """The scale of all pairs of matches, by the adaptive vote (section VI-A)."""
+    warm = _Once()
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        with jax.enable_x64(True):
+            for trial in trials:
+                p = trial.for_solver()
+                inputs = (p.src, p.dst, p.noise_bound, p.mask)
+                vote = lambda x=inputs: float(_scale(*x, cbar2=1.0, criterion=criterion)[0])
+                warm(len(p.src), vote)
+                with _timed() as clock:
+                    scale = vote()
+                rows.append({"scale_error": abs(scale - float(trial.problem.truth.scale))} | clock)
+        return rows
+
+    return Method({"tls": "TLS", "consensus": "consensus maximisation"}[criterion], run)
+
+
+def translation_by_vote(criterion: Criterion) -> Method:
+    """The translation, axis by axis (section VI-C), where the rotation is the identity."""
+    warm = _Once()
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        with jax.enable_x64(True):
+            for trial in trials:
+                p = trial.for_solver()
+                inputs = (p.dst - p.src, p.noise_bound, p.mask)
+                vote = lambda x=inputs: np.asarray(_translation(*x, cbar2=1.0, criterion=criterion)[0])
+                warm(len(p.src), vote)
+                with _timed() as clock:
+                    found = vote()
+                error = float(np.linalg.norm(found - trial.problem.truth.translation))
+                rows.append({"translation": error} | clock)
+        return rows
+
+    return Method({"tls": "TLS", "consensus": "consensus maximisation"}[criterion], run)
+
+
+def clique_alone(name: str, clique: CliqueMethod) -> Method:
+    """What the clique leaves of the wrong matches; the time is that of the whole solve."""
+    run = partial(_in_batches, settings=Settings(clique=clique), measure=_pruned)
+    return Method(name, run, together=True)
+
+
+def before_pruning() -> Method:
+    """The share of wrong matches that the clique starts from."""
+    run = lambda trials, mesh: [{"outliers_left": 1 - float(t.problem.inliers.mean())} for t in trials]
+    return Method("before pruning", run)
+
+
+def rotation_alone(name: str, method: RotationMethod) -> Method:
+    """Rotation search on vectors, without a proof (section VII)."""
+    warm = _Once()
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        for trial in trials:
+            p = trial.problem
+            solve = lambda p=p: solve_rotation(
+                p.src, p.dst, noise_bound=p.noise_bound, method=method, proof=None
+            )
+            if method != "sdp":
+                warm(len(p.src), solve)
+            with _timed() as clock:
+                found = solve()
+            rows.append(errors(trial, _turn(found.rotation)) | {"cost": float(found.cost)} | clock)
+        return rows
+
+    return Method(name, run, slow=method == "sdp")
+
+
+def rotation_certified(name: str, proof: CertifyMethod) -> Method:
+    """GNC's rotation and its certificate (section VIII): proved within 0.1 % and 200 iterations, or not."""
+    warm = _Once()
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        for trial in trials:
+            p = trial.problem
+            found = solve_rotation(p.src, p.dst, noise_bound=p.noise_bound, method="gnc", proof=None)
+            certify = lambda p=p, r=found.rotation: certify_rotation(
+                p.src, p.dst, r, noise_bound=p.noise_bound, iterations=200, method=proof
+            )
+            warm(len(p.src), certify)
+            with _timed() as clock:
+                certificate = certify()
+            rows.append(
+                errors(trial, _turn(found.rotation))
+                | {
+                    "proved": int(certificate.is_optimal),
+                    "suboptimality": float(certificate.suboptimality),
+                    "iterations": int(certificate.iterations),
+                    "cost": float(found.cost),
+                }
+                | clock
+            )
+        return rows
+
+    return Method(name, run, slow=proof == "reference")
+
+
+def errors(trial: Trial, pose: Pose) -> Row:
+    """Of a pose, against the truth; a known scale has none."""
+    error = metrics.errors(pose, trial.problem.truth)
+    row = {"rotation_deg": float(error.rotation_deg), "translation": float(error.translation)}
+    return row if trial.scale is not None else row | {"scale_error": float(error.scale)}
+
+
+def _in_batches(
+    trials: list[Trial],
+    mesh: Mesh | None,
+    *,
+    settings: Settings,
+    measure: Callable[[Trial, Solution], Row] | None = None,
+) -> list[Row]:
+    problems = [trial.for_solver() for trial in trials]
+    solve_batch(problems[:1], settings, mesh=mesh)  # compiles
+    start = time.perf_counter()
+    found: Any = solve_batch(problems, settings, mesh=mesh)
+    timing = {"seconds": (time.perf_counter() - start) / len(trials), "together": len(trials)}
+    return [(measure or _judged)(t, s) | timing for t, s in zip(trials, found, strict=True)]
+
+
+def _judged(trial: Trial, found: Solution) -> Row:
+    return errors(trial, found.pose) | {"ok": int(found.status == Status.OK)}
+
+
+def _pruned(trial: Trial, found: Solution) -> Row:
+    precision, recall = metrics.precision_recall(found.selection.clique, trial.problem.inliers)
+    return {
+        "outliers_left": 1 - precision,
+        "inliers_kept": recall,
+        "proved": int(found.clique_is_maximum),
+    }
+
+
+def _turn(rotation: Any) -> Pose:
+    return Pose(np.asarray(rotation), np.zeros(3), np.asarray(1.0))
+
+
+class _Once:
+    """Runs something the first time a size comes, so that what is timed does not compile."""
+
+    def __init__(self) -> None:
+        self.seen: set[int] = set()
+
+    def __call__(self, size: int, run: Callable[[], Any]) -> None:
+        if size not in self.seen:
+            run()
+            self.seen.add(size)
+
+
+@contextmanager
+def _timed() -> Iterator[Row]:
+    row: Row = {}
+    start = time.perf_counter()
+    yield row
+    row["seconds"] = time.perf_counter() - start
+
+
+_scale = jax.jit(estimate_scale, static_argnames="criterion")
+_translation = jax.jit(estimate_translation, static_argnames="criterion")
+_fit = jax.jit(fit_similarity)

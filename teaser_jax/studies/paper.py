@@ -1,0 +1,131 @@
+"""The report: every figure, table and competitor of the paper beside what the tables of the studies say."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from teaser_jax.files import FileError, whole
+from teaser_jax.studies.catalogue import LABELS, MATCHES, Measure, studies
+from teaser_jax.studies.claims import CLAIMS, COMPETITORS, Claim, Verdict, median
+from teaser_jax.studies.results import ABOUT, PICTURE, Results, read_results
+
+MARKS = {True: "yes", False: "**no**", None: "-"}
+
+
+def write_report(folder: str | Path, output: str | Path) -> Path:
+    """Write ``PAPER.md`` from the tables of the studies in a folder; nothing in it is written by hand.
+
+    Args:
+        folder: Where ``run_study`` put the studies; those that are missing are said to be.
+        output: The file, which appears whole or not at all. It shows the figures by relative paths.
+
+    Raises:
+        FileError: If there is no study in the folder, a table is broken, or the file cannot be written.
+    """
+    folder, output = Path(folder), Path(output)
+    found = {name: read_results(folder / name) for name in studies() if (folder / name / ABOUT).exists()}
+    if not found:
+        raise FileError(f"{folder}: holds no study: run teaser-jax study first.")
+    try:
+        with whole(output) as partial:
+            partial.write_text("\n".join(_report(found, folder, output.parent)) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"{output}: cannot be written: {error.strerror or error}.") from error
+    return output
+
+
+def _report(found: dict[str, Results], folder: Path, here: Path) -> Iterator[str]:
+    yield "# The paper, reproduced"
+    yield ""
+    yield (
+        "*TEASER: Fast and Certifiable Point Cloud Registration* (Yang, Shi, Carlone, T-RO 2020), section "
+        "XI, by its protocol. `teaser-jax study all` fills the tables and `teaser-jax study report` writes this "
+        "page from them, on any machine."
+    )
+    yield ""
+    yield from _claims(found)
+    yield from _competitors(found)
+    for name, study in studies().items():
+        yield f"## {name}"
+        yield ""
+        if name in found:
+            yield from _section(found[name], Path(os.path.relpath(folder / name, here)))
+        else:
+            yield f"Not run: `teaser-jax study {name}` ({study.figure}, {study.title})."
+            yield ""
+
+
+def _claims(found: dict[str, Results]) -> Iterator[str]:
+    yield "## Every figure and table"
+    yield ""
+    yield "| paper | what it reports | here | reproduced |"
+    yield "|---|---|---|---|"
+    for claim in CLAIMS:
+        verdict = _verdict(claim, found)
+        yield f"| {claim.where} | {claim.said} | {verdict.found} | {MARKS[verdict.holds]} |"
+    yield ""
+
+
+def _verdict(claim: Claim, found: dict[str, Results]) -> Verdict:
+    if claim.study is None or claim.test is None:
+        return Verdict(claim.reason)
+    if claim.study not in found:
+        return Verdict("not run")
+    return claim.test(found[claim.study])
+
+
+def _competitors(found: dict[str, Results]) -> Iterator[str]:
+    yield "## Every competitor"
+    yield ""
+    yield "| method | where |"
+    yield "|---|---|"
+    for name, word, reason in COMPETITORS:
+        where = [study for study, results in found.items() if any(word in m for m in results.methods)]
+        yield f"| {name} | {'measured in ' + ', '.join(where) if where else f'not here: {reason}'} |"
+    yield ""
+
+
+def _section(results: Results, place: Path) -> Iterator[str]:
+    about = results.about
+    yield f"{results.title}; seed {about['seed']}. `teaser-jax study {results.study.name}`"
+    yield ""
+    yield f"![{results.study.title}]({(place / PICTURE).as_posix()})"
+    yield ""
+    yield "Share of right answers."
+    yield ""
+    yield from _grid(results, results.methods, lambda m, v: f"{results.success(m, v):.0%}")
+    for measure in results.study.measures:
+        having = [m for m in results.methods if results.has(m, measure.column)]
+        yield f"Median {measure.label}."
+        yield ""
+        yield from _grid(results, having, partial(_number, results, measure=measure))
+    failed = [row for row in results.rows if "error" in row]
+    if failed:
+        first = failed[0]
+        yield f"{len(failed)} runs of other libraries raised; first {first['method']}: {first['error']}"
+        yield ""
+    for made in about["made_with"]:
+        versions = ", ".join(f"{package} {version}" for package, version in made["versions"].items())
+        yield f"*{made['processor']}; {made['devices']}; python {made['python']}; {versions}*"
+        yield ""
+
+
+def _grid(results: Results, methods: list[str], cell: Callable[[str, float], str]) -> Iterator[str]:
+    values = results.values
+    heads = [f"{v:g}" if results.study.sweep == MATCHES else f"{v:.0%}" for v in values]
+    yield f"| {LABELS[results.study.sweep]} | " + " | ".join(heads) + " |"
+    yield "|---" * (len(values) + 1) + "|"
+    for method in methods:
+        cells = [cell(method, v) if results.of(method, v) else "" for v in values]
+        yield f"| {method} | " + " | ".join(cells) + " |"
+    yield ""
+
+
+def _number(results: Results, method: str, value: float, measure: Measure) -> str:
+    number = median(results, method, value, measure.column)
+    return "" if np.isnan(number) else f"{number:.2g}"

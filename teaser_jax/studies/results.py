@@ -1,0 +1,83 @@
+"""What a study has found so far: its table, cell by cell and method by method."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from teaser_jax.files import FileError
+from teaser_jax.studies.catalogue import Study, studies
+from teaser_jax.studies.methods import Row
+from teaser_jax.studies.table import read_table
+
+TABLE, ABOUT, PICTURE, PAGE = "table.csv", "about.json", "figure.png", "figure.html"
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """A study's table and what it is about."""
+
+    study: Study
+    about: dict[str, Any]
+    rows: list[Row]
+
+    @property
+    def title(self) -> str:
+        """Of the figure: what, with which model, how many runs."""
+        study, runs = (
+            self.study,
+            sorted({len(self.of(m, v)) for m in self.methods for v in self.values} - {0}),
+        )
+        spread = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}" if runs else "0"
+        return f"{study.title}; model: {self.about['model']}; {spread} runs a box ({study.figure})"
+
+    @property
+    def values(self) -> list[float]:
+        """The cells, in the study's order."""
+        return [v for v in self.study.values if any(np.isclose(r[self.study.sweep], v) for r in self.rows)]
+
+    @property
+    def methods(self) -> list[str]:
+        """Those of the table, in the study's order; then those whose package is missing here."""
+        there = list(dict.fromkeys(row["method"] for row in self.rows))
+        order = [method.name for method in self.study.methods]
+        return sorted(there, key=lambda name: order.index(name) if name in order else len(order))
+
+    def of(self, method: str, value: float) -> list[Row]:
+        """The rows of one method and cell."""
+        sweep = self.study.sweep
+        return [row for row in self.rows if row["method"] == method and np.isclose(row[sweep], value)]
+
+    def measured(self, method: str, value: float, column: str) -> np.ndarray:
+        """The numbers of a column in one cell; runs that raised have none."""
+        return np.array([row[column] for row in self.of(method, value) if column in row])
+
+    def has(self, method: str, column: str) -> bool:
+        """Whether any row of a method has a number in a column."""
+        return any(row["method"] == method and column in row for row in self.rows)
+
+    def success(self, method: str, value: float) -> float:
+        """Share of the runs with an accepted answer; NaN without runs."""
+        rows = self.of(method, value)
+        return float(np.mean([self.study.right(row) for row in rows])) if rows else float("nan")
+
+
+def read_results(place: str | Path) -> Results:
+    """The results in the folder of a study.
+
+    Raises:
+        FileError: If it is no such folder, or its files are broken.
+    """
+    place = Path(place)
+    try:
+        about = json.loads((place / ABOUT).read_text())
+        study = studies()[about["study"]]
+    except FileNotFoundError:
+        raise FileError(f"{place}: no study there: run teaser-jax study first.") from None
+    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+        raise FileError(f"{place / ABOUT}: is no description of a study ({error}).") from error
+    return Results(study, about, read_table(place / TABLE))

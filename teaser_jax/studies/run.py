@@ -1,0 +1,240 @@
+"""Run a study: the rows that its table lacks, then its figure. Whatever ends it, it goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from importlib import metadata
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from jax.sharding import Mesh
+from tqdm import tqdm
+
+from teaser_jax.batch.processes import all_of
+from teaser_jax.files import FileError, one_line, whole
+from teaser_jax.studies.catalogue import Study, studies
+from teaser_jax.studies.figures import check_drawing, draw_study
+from teaser_jax.studies.methods import Method, Row
+from teaser_jax.studies.results import ABOUT, TABLE
+from teaser_jax.studies.table import Table
+from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, whole_number
+
+PACKAGES = ("teaser-jax", "jax", "jaxlib", "numpy", "numba", "scs", "kiss-matcher", "open3d-cpu", "open3d")
+PROTOCOL = 1  # raised when a study draws other problems for the same seed
+
+
+class Todo(NamedTuple):
+    """Runs that a table lacks, of one cell and method."""
+
+    value: float
+    method: Method
+    numbers: list[int]
+
+
+def run_study(
+    name: str,
+    folder: str | Path,
+    *,
+    runs: int | None = None,
+    seed: int = 0,
+    model: Model = TEAPOT,
+    methods: Sequence[str] | None = None,
+    mesh: Mesh | None = None,
+    quick: bool = False,
+    progress: bool = False,
+) -> Path:
+    """Run one of the paper's studies, or go on with it, and draw its figure.
+
+    Every problem follows from the study, the seed, the cell and the run, so that all methods see the same
+    ones and a table that was interrupted is finished as if it had not been: rows that are there stay, the
+    others are computed. Ask for more ``runs`` or other ``methods`` later to add to a table.
+
+    Args:
+        name: One of ``studies()``.
+        folder: Where ``NAME/table.csv``, ``about.json``, ``figure.png`` and ``figure.html`` go.
+        runs: Problems a cell; None: the study's own, 40 or more.
+        seed: Of the whole study.
+        model: What points are drawn from, see ``read_model``.
+        methods: Names of those that take part; None: all, in a quick study without the slow ones.
+        mesh: Devices for the methods that take problems in batches; None: all. Under ``jax.distributed``
+            every process calls, shares the work, and the first one writes.
+        quick: A few cells of three runs each, in two minutes.
+        progress: Show a bar with the time left.
+
+    Returns:
+        The folder of the study.
+
+    Raises:
+        StudyError: On names, runs or seeds that make no sense; it is a ValueError.
+        FileError: If the folder holds a study of another model or seed, or cannot be written.
+        ImportError: Without the extra ``studies``, before anything is computed.
+    """
+    check_drawing()
+    study = named_study(name)
+    chosen = _chosen(study, methods, quick)
+    cells = study.cells(runs, quick=quick)
+    seed = whole_number("seed", seed, 0)
+    place = Path(folder) / name
+    with ExitStack() as stack:
+        table, known, failure = None, set(), None
+        if jax.process_index() == 0:
+            try:
+                table = stack.enter_context(_opened(place, study, seed, model))
+                known = {_key(row, study) for row in table.rows}
+            except FileError as error:
+                failure = str(error)
+        known, failure = all_of((known, failure))[0]
+        if failure is not None:
+            raise FileError(failure)  # in every process, or the others would wait
+        todo = list(_todo(cells, chosen, known, lambda value: study.trial(seed, value, 0, model)))
+        bar = stack.enter_context(
+            tqdm(total=sum(len(t.numbers) for t in todo), disable=not progress, unit="row", desc=name)
+        )
+        for rows in _rows(study, todo, seed, model, mesh):
+            if table is not None:
+                table.append(rows)
+            bar.update(len(rows))
+    if jax.process_index() == 0:
+        draw_study(place)
+    return place
+
+
+def _rows(study: Study, todo: list[Todo], seed: int, model: Model, mesh: Mesh | None) -> Iterator[list[Row]]:
+    """The rows of the table as they come, cell by cell."""
+    for value, cell in groupby(todo, key=lambda t: t.value):
+        listed = list(cell)
+        numbers = sorted({k for each in listed for k in each.numbers})
+        trials = {k: study.trial(seed, value, k, model) for k in numbers}
+        for _, method, some in listed:
+            yield from _answers(study, method, [trials[k] for k in some], mesh)
+
+
+def _answers(study: Study, method: Method, trials: list[Trial], mesh: Mesh | None) -> Iterator[list[Row]]:
+    def named(some: list[Trial], measured: list[Row]) -> list[Row]:
+        return [
+            {study.sweep: t.value, "trial": t.number, "method": method.name} | row
+            for t, row in zip(some, measured, strict=True)
+        ]
+
+    if method.together:
+        yield named(trials, method.run(trials, mesh))
+    elif jax.process_count() == 1:
+        for trial in trials:
+            yield named([trial], _guarded(method, trial))
+    else:
+        share = trials[jax.process_index() :: jax.process_count()]
+        rows = [row for trial in share for row in named([trial], _guarded(method, trial))]
+        yield [row for some in all_of(rows) for row in some]
+
+
+def _guarded(method: Method, trial: Trial) -> list[Row]:
+    """A row of measures; for another library that raises, a row that says so."""
+    try:
+        return method.run([trial], None)
+    except Exception as error:
+        if not method.others:
+            raise
+        return [{"error": f"{type(error).__name__}: {one_line(error)}"}]
+
+
+def _todo(
+    cells: list[tuple[float, range]],
+    chosen: list[Method],
+    known: set[tuple[Any, ...]],
+    first: Callable[[float], Trial],
+) -> Iterator[Todo]:
+    """What is missing, of the methods that the first trial of a cell suits."""
+    for value, numbers in cells:
+        trial = first(value)
+        for method in chosen:
+            missing = [k for k in numbers if (_short(value), k, method.name) not in known]
+            if missing and method.suits(trial):
+                yield Todo(value, method, missing)
+
+
+def _key(row: Row, study: Study) -> tuple[Any, ...]:
+    return _short(row[study.sweep]), int(row["trial"]), row["method"]
+
+
+def _short(value: float) -> str:
+    """A value as tables write it, so that what is read equals what is asked."""
+    return f"{value:.7g}"
+
+
+def _opened(place: Path, study: Study, seed: int, model: Model) -> Table:
+    """The table of a study in its folder, which must be of the same problems."""
+    about = {
+        "study": study.name, "figure": study.figure, "title": study.title, "sweep": study.sweep,
+        "model": model.name, "seed": seed, "protocol": PROTOCOL,
+    }  # fmt: skip
+    path = place / ABOUT
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        before: dict[str, Any] = json.loads(path.read_text()) if path.exists() else about | {"made_with": []}
+        for key in ("study", "model", "seed", "protocol"):
+            if before.get(key) != about[key]:
+                raise FileError(
+                    f"{place}: holds a study of {key} {before.get(key)!r}, and {about[key]!r} is asked for: "
+                    "name another folder."
+                )
+        here = environment()
+        made_with = [*before["made_with"], *([] if here in before["made_with"] else [here])]
+        table = Table(place / TABLE, (study.sweep, "trial", "method", *study.columns, "error"))
+        with whole(path) as partial:
+            partial.write_text(json.dumps(about | {"made_with": made_with}, indent=1) + "\n")
+        return table
+    except OSError as error:
+        raise FileError(f"{place}: cannot be written: {error.strerror or error}.") from error
+    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise FileError(f"{path}: is no description of a study ({error}): remove the folder.") from error
+
+
+def environment() -> dict[str, Any]:
+    """Machine and versions, as a report states them."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    device = jax.devices()[0]
+    return {
+        "processor": _processor(),
+        "devices": f"{jax.device_count()} x {device.device_kind} ({device.platform})",
+        "processes": jax.process_count(),
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+def _processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{named[0]}, {len(named)} cores" if named else platform.processor() or platform.machine()
+
+
+def named_study(name: str) -> Study:
+    """One of ``studies()``; StudyError with their names if there is none."""
+    known = studies()
+    if name not in known:
+        raise StudyError(f"there is no study {name!r}: expected one of {', '.join(known)}.")
+    return known[name]
+
+
+def _chosen(study: Study, names: Sequence[str] | None, quick: bool) -> list[Method]:
+    if names is None:
+        return [each for each in study.methods if not (quick and each.slow)]
+    known = {each.name: each for each in study.methods}
+    for name in names:
+        if name not in known:
+            raise StudyError(
+                f"{name!r} takes no part in {study.name}, or its package is missing: expected some of "
+                f"{', '.join(map(repr, known))}."
+            )
+    return [known[name] for name in names]

@@ -1,0 +1,142 @@
+"""Problems in files, so that another program can be measured on the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from teaser_jax.files import FileError, one_line, whole
+from teaser_jax.studies.catalogue import Study
+from teaser_jax.studies.trials import TEAPOT, Model, Trial, whole_number
+from teaser_jax.synthetic import SyntheticProblem
+from teaser_jax.types import Pose
+
+SHARD_BYTES = 64_000_000
+SHAPES = {
+    "src": 3, "dst": 3, "inliers": 2, "noise_bound": 1, "rotation": 3, "translation": 2, "scale": 1,
+    "known_scale": 1, "value": 1, "trial": 1,
+}  # fmt: skip
+
+
+def draw_trials(
+    study: Study, *, runs: int | None = None, seed: int = 0, model: Model = TEAPOT, quick: bool = False
+) -> Iterator[Trial]:
+    """The problems of a study, cell by cell: those that ``run_study`` asks every method.
+
+    Raises:
+        StudyError: On runs or a seed that make no sense.
+    """
+    for value, numbers in study.cells(runs, quick=quick):
+        for number in numbers:
+            yield study.trial(whole_number("seed", seed, 0), value, number, model)
+
+
+def save_trials(
+    folder: str | Path, trials: Iterable[Trial], *, name: str = "problems", shard_bytes: int = SHARD_BYTES
+) -> list[Path]:
+    """Write problems as ``NAME-00000.npz`` and so on, b problems of n matches in each.
+
+    Arrays of a shard: ``src``, ``dst`` (b, n, 3); ``inliers`` (b, n), the right matches; ``noise_bound``
+    (b,); the truth as ``rotation`` (b, 3, 3), ``translation`` (b, 3), ``scale`` (b,) and as ``T_dst_src``
+    (b, 4, 4); ``known_scale`` (b,), NaN where it is to be estimated; ``value`` (b,), what the study sweeps;
+    ``trial`` (b,), the run. Problems of different sizes go to different shards, and
+    their order is kept. Every shard appears whole or not at all; older shards of that name are removed.
+
+    Args:
+        folder: Made if it does not exist.
+        trials: As from ``draw_trials``; read one by one, so that any number fits.
+        name: How the files begin.
+        shard_bytes: About the largest size of a file.
+
+    Returns:
+        The files, in order.
+
+    Raises:
+        FileError: If they cannot be written.
+    """
+    folder = Path(folder)
+    written: list[Path] = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for shard in _shards(trials, shard_bytes):
+            path = folder / f"{name}-{len(written):05d}.npz"
+            with whole(path) as partial:
+                arrays: dict[str, Any] = _arrays(shard)
+                np.savez_compressed(partial, **arrays)
+            written.append(path)
+        for older in set(folder.glob(f"{name}-[0-9][0-9][0-9][0-9][0-9].npz")) - set(written):
+            older.unlink()
+    except OSError as error:
+        raise FileError(f"{folder}: cannot be written: {error.strerror or error}.") from error
+    return written
+
+
+def read_trials(paths: str | Path | Sequence[str | Path]) -> Iterator[Trial]:
+    """The problems of ``save_trials`` again, bit for bit, one by one.
+
+    Args:
+        paths: A folder, whose shards are read in order of their names; or a shard, or several.
+
+    Raises:
+        FileError: If there is no shard, or one is broken or holds something else.
+    """
+    listed = [paths] if isinstance(paths, str | Path) else list(paths)
+    for given in map(Path, listed):
+        shards = sorted(given.glob("*.npz")) if given.is_dir() else [given]
+        if not shards:
+            raise FileError(f"{given}: holds no shard (.npz).")
+        for path in shards:
+            yield from _read(path)
+
+
+def _shards(trials: Iterable[Trial], shard_bytes: int) -> Iterator[list[Trial]]:
+    for size, some in groupby(trials, key=lambda t: len(t.problem.src)):
+        most, shard = max(1, shard_bytes // (49 * size + 200)), []
+        for trial in some:
+            shard.append(trial)
+            if len(shard) == most:
+                yield shard
+                shard = []
+        if shard:
+            yield shard
+
+
+def _arrays(trials: list[Trial]) -> dict[str, np.ndarray]:
+    problems = [trial.problem for trial in trials]
+    return {
+        "src": np.stack([p.src for p in problems]),
+        "dst": np.stack([p.dst for p in problems]),
+        "inliers": np.stack([p.inliers for p in problems]),
+        "noise_bound": np.array([p.noise_bound for p in problems]),
+        "rotation": np.stack([p.truth.rotation for p in problems]),
+        "translation": np.stack([p.truth.translation for p in problems]),
+        "scale": np.array([p.truth.scale for p in problems], np.float64),
+        "T_dst_src": np.stack([p.truth.matrix for p in problems]),
+        "known_scale": np.array([np.nan if t.scale is None else t.scale for t in trials]),
+        "value": np.array([t.value for t in trials]),
+        "trial": np.array([t.number for t in trials]),
+    }
+
+
+def _read(path: Path) -> Iterator[Trial]:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in SHAPES}
+    except FileNotFoundError:
+        raise FileError(f"{path}: no such file.") from None
+    except Exception as error:  # a broken archive makes its reader raise nearly anything
+        raise FileError(f"{path}: is no shard of problems ({one_line(error)}).") from error
+    count = len(arrays["value"]) if arrays["value"].ndim else 0
+    for name, dimensions in SHAPES.items():
+        if arrays[name].ndim != dimensions or len(arrays[name]) != count:
+            raise FileError(f"{path}: {name} has shape {arrays[name].shape}: it is no shard of problems.")
+    for k in range(count):
+        one: dict[str, Any] = {name: array[k] for name, array in arrays.items()}
+        truth = Pose(one["rotation"], one["translation"], one["scale"])
+        problem = SyntheticProblem(one["src"], one["dst"], truth, one["inliers"], float(one["noise_bound"]))
+        scale = None if np.isnan(one["known_scale"]) else float(one["known_scale"])
+        yield Trial(float(one["value"]), int(one["trial"]), problem, scale)
