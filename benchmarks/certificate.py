@@ -11,9 +11,9 @@ import numpy as np
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
-from benchmarks.models import bunny_mesh
 from benchmarks.problems import DATA, protocol
 from benchmarks.processes import forget_peak, in_child, peak_megabytes
+from teaser_jax.studies import read_model
 
 SIGMA, BOUND = 0.01, 0.0554
 RATES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -50,7 +50,7 @@ def vectors(seed: tuple[int, ...], k: int, rate: float) -> tuple[np.ndarray, np.
 
 def _points(path: Path) -> np.ndarray:
     """Vertices of the Bunny, scaled into the unit cube."""
-    points = bunny_mesh(path).vertices
+    points = read_model(path).shape.vertices
     points = points - points.min(axis=0)
     return points / points.max()
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from benchmarks.problems import DATA
-from teaser_jax import synthetic
+from teaser_jax import studies, synthetic
 
+FILES = {"bunny": "bunny.ply", "armadillo": "armadillo.npy", "dragon": "dragon_scan1.npy"}
 DENSE = 20_000  # points of a surface
 Points = np.ndarray
 
@@ -29,20 +28,6 @@ def real_models() -> dict[str, list[Points]]:
     folder = DATA / "models"
     if not folder.is_dir():
         return {}
-    bunny = synthetic.sample_model(np.random.default_rng(0), DENSE, bunny_mesh(folder / "bunny.ply"))
-    clouds = {
-        "bunny": bunny,
-        "armadillo": np.load(folder / "armadillo.npy"),
-        "dragon": np.load(folder / "dragon_scan1.npy"),
-    }
+    shape = {name: studies.read_model(folder / file).shape for name, file in FILES.items()}
+    clouds = shape | {"bunny": synthetic.sample_model(np.random.default_rng(0), DENSE, shape["bunny"])}
     return {name: [unit(np.asarray(points, np.float64))] for name, points in clouds.items()}
-
-
-def bunny_mesh(path: Path) -> synthetic.Mesh:
-    """Vertices and triangles of an ASCII PLY file."""
-    lines = path.read_text().splitlines()
-    start = lines.index("end_header") + 1
-    counts = {line.split()[1]: int(line.split()[2]) for line in lines[:start] if line.startswith("element")}
-    vertices = np.array([line.split()[:3] for line in lines[start : start + counts["vertex"]]], np.float64)
-    rest = lines[start + counts["vertex"] :][: counts["face"]]
-    return synthetic.Mesh(vertices, np.array([line.split()[1:4] for line in rest], np.int64))

@@ -100,8 +100,13 @@ def one_line(message: object, limit: int = 300) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
+def read_archive(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz``; FileError if it is none, and OSError if it cannot be read."""
+    return _guarded(path, "is no .npz archive, or is broken", lambda: _arrays(path))
+
+
 def _read_npz(path: Path) -> Matches:
-    arrays = _guarded(path, "is no .npz archive, or is broken", lambda: _arrays(path))
+    arrays = read_archive(path)
     for name in ("src", "dst"):
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "nothing"

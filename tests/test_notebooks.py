@@ -22,12 +22,13 @@ NOTEBOOKS = [
         "02_inside_the_method",
         "03_certificates",
         "04_learning_through_registration",
+        "05_batches_and_devices",
     )
 ]
 
 
-# The one on certificates registers a thousand problems, the one on learning trains three networks.
-SLOW = ("03_certificates", "04_learning_through_registration")
+# They register a thousand problems, train three networks, compile for four devices.
+SLOW = ("03_certificates", "04_learning_through_registration", "05_batches_and_devices")
 LONG = [pytest.param(p, marks=pytest.mark.slow) if p.stem in SLOW else p for p in NOTEBOOKS]
 
 

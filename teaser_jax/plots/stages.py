@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 SRC, DST, GOOD, BAD, INK, PALE = "#e4842d", "#3a6ea5", "#1f9d55", "#c8443b", "#30343b", "#b9bec7"
 PANEL_SHAPE = 1.3
+LEGEND_COLUMNS = 5
 
 
 def plot_registration(
@@ -387,4 +388,10 @@ def legend(figure: Figure, colors: dict[str, str]) -> None:
                linestyle="-" if name in ("inliers", "rejected matches") else "", label=name)
         for name, color in colors.items()
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=9)
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=min(len(handles), LEGEND_COLUMNS),
+        frameon=False,
+        fontsize=9,
+    )

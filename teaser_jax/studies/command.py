@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+import jax
+
 from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.paper import write_report
 from teaser_jax.studies.peers import find_peers
@@ -42,12 +44,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--export", type=Path, metavar="DIR", help="write the problems as .npz shards, and solve nothing"
     )
     parser.add_argument(
+        "--cluster", nargs="?", const="", metavar="HOST:PORT,N,K",
+        help="share the work among N processes, of which this is number K; alone, as Slurm or Open MPI say",
+    )  # fmt: skip
+    parser.add_argument(
         "-o", "--output", type=Path, metavar="MD", help=f"of {REPORT} (default: PAPER.md in the folder)"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what the arguments say. Raises StudyError, FileError or ImportError on what cannot be done."""
+    if arguments.cluster is not None:
+        _join(arguments.cluster)
     if arguments.name == LIST:
         return _list()
     if arguments.name == REPORT:
@@ -63,6 +71,20 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             _run(name, model, arguments)
     return 0
+
+
+def _join(cluster: str) -> None:
+    """Become one of several processes (``jax.distributed``), before any device is looked at."""
+    if not cluster:
+        jax.distributed.initialize()
+        return
+    address, *numbers = cluster.split(",")
+    if len(numbers) != 2 or not all(x.isdecimal() for x in numbers) or ":" not in address:
+        raise StudyError(f"--cluster is {cluster!r}: expected HOST:PORT,N,K as in 127.0.0.1:9876,2,0")
+    count, number = map(int, numbers)
+    if number >= count:
+        raise StudyError(f"--cluster is {cluster!r}: of {count} processes the last is number {count - 1}")
+    jax.distributed.initialize(address, count, number)
 
 
 def _list() -> int:
@@ -86,9 +108,10 @@ def _run(name: str, model: Model, arguments: argparse.Namespace) -> None:
         place = run_study(
             name, arguments.folder,
             runs=arguments.runs, seed=arguments.seed, model=model, methods=arguments.method,
-            quick=arguments.quick, progress=True,
+            quick=arguments.quick, progress=jax.process_index() == 0,
         )  # fmt: skip
     except KeyboardInterrupt:
         print(f"\nteaser-jax: {name} is not finished: the same command goes on where it was", file=sys.stderr)
         raise
-    print("\n".join(str(place / file) for file in (TABLE, PICTURE, PAGE)))
+    if jax.process_index() == 0:
+        print("\n".join(str(place / file) for file in (TABLE, PICTURE, PAGE)))

@@ -44,8 +44,8 @@ def _report(found: dict[str, Results], folder: Path, here: Path) -> Iterator[str
     yield ""
     yield (
         "*TEASER: Fast and Certifiable Point Cloud Registration* (Yang, Shi, Carlone, T-RO 2020), section "
-        "XI, by its protocol. `teaser-jax study all` fills the tables and `teaser-jax study report` writes this "
-        "page from them, on any machine."
+        "XI, by its protocol. `teaser-jax study all` fills the tables and `teaser-jax study report` writes "
+        "this page from them, on any machine."
     )
     yield ""
     yield from _claims(found)

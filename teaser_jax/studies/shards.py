@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from teaser_jax.files import FileError, one_line, whole
+from teaser_jax.files import FileError, read_archive, whole
 from teaser_jax.studies.catalogue import Study
 from teaser_jax.studies.trials import TEAPOT, Model, Trial, whole_number
 from teaser_jax.synthetic import SyntheticProblem
@@ -124,12 +124,13 @@ def _arrays(trials: list[Trial]) -> dict[str, np.ndarray]:
 
 def _read(path: Path) -> Iterator[Trial]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in SHAPES}
+        arrays = read_archive(path)
     except FileNotFoundError:
         raise FileError(f"{path}: no such file.") from None
-    except Exception as error:  # a broken archive makes its reader raise nearly anything
-        raise FileError(f"{path}: is no shard of problems ({one_line(error)}).") from error
+    except OSError as error:
+        raise FileError(f"{path}: cannot be read: {error.strerror or error}.") from error
+    if missing := set(SHAPES) - set(arrays):
+        raise FileError(f"{path}: is no shard of problems: it lacks {', '.join(sorted(missing))}.")
     count = len(arrays["value"]) if arrays["value"].ndim else 0
     for name, dimensions in SHAPES.items():
         if arrays[name].ndim != dimensions or len(arrays[name]) != count:

@@ -1,0 +1,372 @@
+"""Studies: every row once, whatever ends the program; the same problems for all; figures and a report."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+
+import numpy as np
+import pytest
+
+import teaser_jax as tj
+from teaser_jax.files import FileError
+from teaser_jax.studies import (
+    Model,
+    StudyError,
+    draw_trials,
+    read_model,
+    read_results,
+    read_table,
+    read_trials,
+    run_study,
+    save_trials,
+    studies,
+    write_report,
+)
+from teaser_jax.studies.claims import CLAIMS, COMPETITORS, Verdict, breaks_at, robust_to
+from teaser_jax.studies.methods import Method
+from teaser_jax.studies.table import Table
+
+TLS = ["TLS"]
+ON_CPU = os.environ | {"JAX_PLATFORMS": "cpu"}
+COMMAND = [sys.executable, "-m", "teaser_jax.cli", "study"]
+
+
+def keys(rows, sweep="outlier_rate"):
+    return Counter((row[sweep], row["trial"], row["method"]) for row in rows)
+
+
+def without_times(rows):
+    return sorted(
+        ({k: v for k, v in row.items() if k != "seconds"} for row in rows),
+        key=lambda row: (row["outlier_rate"], row["trial"], row["method"]),
+    )
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory):
+    """One run a cell of the study of Fig. 6a, of two methods of ours."""
+    folder = tmp_path_factory.mktemp("quick")
+    chosen = ["teaser_jax", "least squares on the true inliers"]
+    run_study("known-scale", folder, quick=True, runs=2, methods=chosen)
+    return folder
+
+
+def test_a_killed_study_loses_and_repeats_no_row(tmp_path):
+    table, runs = tmp_path / "translation" / "table.csv", 30
+    command = [*COMMAND, "translation", "--folder", str(tmp_path), "--runs", str(runs), "--method", "TLS"]
+    study = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not table.exists() or table.read_bytes().count(b"\n") < 20:
+        assert study.poll() is None, "it ended before it could be killed"
+        time.sleep(0.002)
+    study.send_signal(signal.SIGKILL)
+    study.wait()
+    before = read_table(table)
+    assert 0 < len(before) < 10 * runs
+    run_study("translation", tmp_path, runs=runs, methods=TLS)
+    after = read_table(table)
+    assert after[: len(before)] == before
+    assert len(after) == 10 * runs
+    assert set(keys(after).values()) == {1}
+    run_study("translation", tmp_path / "at once", runs=runs, methods=TLS)
+    assert without_times(after) == without_times(
+        read_table(tmp_path / "at once" / "translation" / "table.csv")
+    )
+
+
+def test_two_processes_write_the_rows_of_one(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    # One method takes its trials together, the other one by one.
+    for study, method in (("known-scale", "teaser_jax"), ("translation", "TLS")):
+        command = [*COMMAND, study, "--folder", str(tmp_path), "--quick", "--runs", "2", "--method", method]
+        both = [subprocess.Popen([*command, "--cluster", f"{address},2,{k}"], env=ON_CPU) for k in range(2)]
+        assert [each.wait(timeout=300) for each in both] == [0, 0]
+        run_study(study, tmp_path / "alone", quick=True, runs=2, methods=[method])
+        shared, alone = (
+            read_table(folder / study / "table.csv") for folder in (tmp_path, tmp_path / "alone")
+        )
+        assert without_times(shared) == without_times(alone)
+
+
+def test_a_row_cut_in_the_middle_is_computed_again(tmp_path):
+    run_study("translation", tmp_path, runs=2, quick=True, methods=TLS)
+    table = tmp_path / "translation" / "table.csv"
+    whole = table.read_bytes()
+    for cut in (1, 7, len(whole.splitlines()[-1])):
+        table.write_bytes(whole[:-cut])
+        assert len(read_table(table)) == 7
+        run_study("translation", tmp_path, runs=2, quick=True, methods=TLS)
+        assert without_times(read_table(table)) == without_times(read_table_of(whole, tmp_path))
+
+
+def read_table_of(content, folder):
+    (folder / "other.csv").write_bytes(content)
+    return read_table(folder / "other.csv")
+
+
+def test_runs_and_methods_are_added_to_a_table(tmp_path):
+    run_study("translation", tmp_path, runs=1, quick=True, methods=TLS)
+    first = read_table(tmp_path / "translation" / "table.csv")
+    run_study("translation", tmp_path, runs=3, quick=True)
+    after = read_table(tmp_path / "translation" / "table.csv")
+    assert after[: len(first)] == first
+    assert len(after) == len(keys(after)) == 4 * 3 * 2
+
+
+def test_another_model_or_seed_needs_another_folder(tmp_path):
+    run_study("translation", tmp_path, runs=1, quick=True, methods=TLS)
+    with pytest.raises(FileError, match="seed 0, and 1 is asked for: name another folder"):
+        run_study("translation", tmp_path, runs=1, quick=True, seed=1)
+    cloud = Model("box", np.random.default_rng(0).random((200, 3)))
+    with pytest.raises(FileError, match="model 'teapot', and 'box' is asked for"):
+        run_study("translation", tmp_path, runs=1, quick=True, model=cloud)
+
+
+def test_one_writer_at_a_time(tmp_path):
+    pytest.importorskip("fcntl")
+    path = tmp_path / "table.csv"
+    with Table(path, ("a", "b")) as table:
+        table.append([{"a": 1.5}, {"a": 2, "b": float("nan")}])
+        with pytest.raises(FileError, match="another program is writing it"):
+            Table(path, ("a", "b"))
+    with pytest.raises(FileError, match="holds other columns"):
+        Table(path, ("a", "c"))
+    with Table(path, ("a", "b")) as again:
+        assert again.rows[0] == {"a": 1.5}
+        assert np.isnan(again.rows[1]["b"])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("a,b\n1\n", "line 2 has 1 fields, the header 2"),
+        ("a,b\n1,x\n", "line 2: could not convert"),
+        (None, "run the study first"),
+    ],
+)
+def test_a_broken_table_is_named(tmp_path, content, said):
+    if content is not None:
+        (tmp_path / "t.csv").write_text(content)
+    with pytest.raises(FileError, match=said):
+        read_table(tmp_path / "t.csv")
+
+
+def test_answers_are_right_and_all_methods_see_the_same_problems(quick):
+    results = read_results(quick / "known-scale")
+    assert results.values == [0.0, 0.5, 0.9]
+    for method in results.methods:
+        for value in results.values:
+            assert results.success(method, value) == 1
+    # Refined on all matches, the answer is the fit to the true inliers.
+    for value in results.values:
+        limit, ours = (results.measured(m, value, "rotation_deg") for m in results.methods)
+        np.testing.assert_allclose(ours, limit, rtol=0.2)
+    assert results.measured("teaser_jax", 0.5, "together").tolist() == [2, 2]
+
+
+def test_the_figure_is_drawn_and_the_page_stands_alone(quick):
+    place = quick / "known-scale"
+    assert (place / "figure.png").read_bytes().startswith(b"\x89PNG")
+    page = (place / "figure.html").read_text()
+    assert "least squares on the true inliers" in page
+    assert "rotation error [deg]" in page
+    assert 'src="http' not in page
+    about = json.loads((place / "about.json").read_text())
+    assert about["model"] == "teapot"
+    assert about["made_with"][0]["versions"]["jax"]
+
+
+def test_the_report_has_a_row_for_every_figure_table_and_competitor(quick, tmp_path):
+    path = write_report(quick, tmp_path / "PAPER.md")
+    text = path.read_text()
+    for claim in CLAIMS:
+        assert f"| {claim.where} | {claim.said} |" in text
+    for name, _, _ in COMPETITORS:
+        assert f"| {name} |" in text
+    for name in studies():
+        assert f"\n## {name}\n" in text
+    assert "known-scale/figure.png" in text
+    assert "Not run: `teaser-jax study extreme`" in text
+    for figure in ("1", "2", "3", "4a", "4b", "4c", "4d", "5", "6a", "6b", "6c", "7a, b", "7c", "9"):
+        assert f"| Fig. {figure} |" in text
+    for table in ("Table I", "Table II"):
+        assert table in text
+    with pytest.raises(FileError, match="holds no study"):
+        write_report(tmp_path, tmp_path / "none.md")
+
+
+def test_claims_are_tested_and_not_believed(quick):
+    results = read_results(quick / "known-scale")
+    assert robust_to("teaser_jax", 0.9)(results).holds is True
+    assert robust_to("nobody", 0.9)(results) == Verdict("not run")
+    assert breaks_at("teaser_jax", 0.9)(results).holds is False
+    for row in results.rows:
+        if row["outlier_rate"] == 0.9:
+            row["rotation_deg"] = 90.0
+    assert robust_to("teaser_jax", 0.9)(results).holds is False
+    assert robust_to("teaser_jax", 0.5)(results).holds is True
+    assert breaks_at("teaser_jax", 0.9)(results).holds is True
+
+
+def test_what_another_library_raises_is_a_row(tmp_path, monkeypatch):
+    def broken(trials, mesh):
+        raise RuntimeError("no such\nthing")
+
+    one = dataclasses.replace(
+        studies()["translation"],
+        methods=(Method("broken", broken, others=True), Method("silent", lambda trials, mesh: [{}])),
+    )
+    monkeypatch.setattr("teaser_jax.studies.run.studies", lambda: {"translation": one})
+    run_study("translation", tmp_path, runs=1, quick=True)
+    rows = read_table(tmp_path / "translation" / "table.csv")
+    assert {row["error"] for row in rows if row["method"] == "broken"} == {"RuntimeError: no such thing"}
+    assert len(rows) == 8
+    ours = dataclasses.replace(one, methods=(Method("ours", broken),))
+    monkeypatch.setattr("teaser_jax.studies.run.studies", lambda: {"translation": ours})
+    with pytest.raises(RuntimeError, match="no such"):
+        run_study("translation", tmp_path, runs=1, quick=True)
+
+
+def test_every_study_draws_what_it_says():
+    for study in studies().values():
+        trial = study.trial(0, study.quick_values[-1], 0, Model())
+        again = study.trial(0, study.quick_values[-1], 0, Model())
+        other = study.trial(1, study.quick_values[-1], 0, Model())
+        np.testing.assert_array_equal(trial.problem.dst, again.problem.dst)
+        assert not np.array_equal(trial.problem.dst, other.problem.dst)
+        p = trial.problem
+        error = np.linalg.norm(p.dst - p.truth.apply(p.src), axis=1)
+        assert (error[p.inliers] <= p.noise_bound).all()
+        if study.sweep == "outlier_rate":
+            assert p.inliers.mean() == pytest.approx(1 - study.quick_values[-1], abs=0.02)
+        if trial.scale is not None:
+            assert p.truth.scale == trial.scale
+        assert set(study.quick_values) <= set(study.values)
+        assert len({m.name for m in study.methods}) == len(study.methods)
+
+
+def test_problems_come_back_from_shards_bit_for_bit(tmp_path):
+    drawn = [
+        *draw_trials(studies()["unknown-scale"], runs=3, quick=True),
+        *draw_trials(studies()["scale"], runs=2, quick=True),
+    ]
+    files = save_trials(tmp_path, drawn, shard_bytes=15_000)
+    assert len(files) > 3
+    back = list(read_trials(tmp_path))
+    assert len(back) == len(drawn)
+    for a, b in zip(drawn, back, strict=True):
+        assert (a.value, a.number, a.scale) == (b.value, b.number, b.scale)
+        for name in ("src", "dst", "inliers", "noise_bound"):
+            np.testing.assert_array_equal(getattr(a.problem, name), getattr(b.problem, name))
+        np.testing.assert_array_equal(a.problem.truth.matrix, b.problem.truth.matrix)
+    # A smaller set under the same name leaves nothing of the larger one behind.
+    assert save_trials(tmp_path, drawn[:1]) == files[:1]
+    assert len(list(read_trials(tmp_path))) == 1
+
+
+def test_shards_that_are_none(tmp_path):
+    with pytest.raises(FileError, match="holds no shard"):
+        list(read_trials(tmp_path))
+    with pytest.raises(FileError, match="no such file"):
+        list(read_trials(tmp_path / "x.npz"))
+    (tmp_path / "x.npz").write_bytes(b"PK\x03\x04 no archive")
+    with pytest.raises(FileError, match="is no .npz archive"):
+        list(read_trials(tmp_path / "x.npz"))
+    np.savez(tmp_path / "x.npz", src=np.zeros((2, 3)))
+    with pytest.raises(FileError, match="it lacks dst, inliers"):
+        list(read_trials(tmp_path / "x.npz"))
+
+
+def test_models_from_files(tmp_path):
+    import trimesh
+
+    box = trimesh.creation.box()
+    box.export(tmp_path / "box.ply")
+    mesh = read_model(tmp_path / "box.ply")
+    assert mesh.name == "box"
+    assert isinstance(mesh.shape, tj.synthetic.Mesh)
+    assert len(mesh.shape.faces) == 12
+    trimesh.PointCloud(box.sample(300)).export(tmp_path / "points.ply")
+    assert read_model(tmp_path / "points.ply").shape.shape == (300, 3)
+    np.save(tmp_path / "points.npy", box.sample(150))
+    problem = studies()["known-scale"].trial(0, 0.5, 0, read_model(tmp_path / "points.npy")).problem
+    assert problem.src.shape == (100, 3)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "no such file"),
+        (b"nothing", "cannot be read as a model"),
+        (np.zeros((5, 2)), "expected .m, 3. points"),
+        (np.full((5, 3), np.nan), "not finite"),
+    ],
+)
+def test_models_that_are_none(tmp_path, content, said):
+    path = tmp_path / "m.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.save(path, content)
+    with pytest.raises(FileError, match=said):
+        read_model(path)
+
+
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        ({"name": "nothing"}, "there is no study 'nothing': expected one of scale, clique"),
+        ({"runs": 0}, "runs is 0: expected a whole number, 1 or above"),
+        ({"seed": -1}, "seed is -1"),
+        ({"methods": ["MOSEK"]}, "'MOSEK' takes no part in translation.*'TLS'"),
+    ],
+)
+def test_what_makes_no_sense_is_said_before_anything_is_written(tmp_path, known, said):
+    with pytest.raises(StudyError, match=said):
+        run_study(**{"name": "translation", "folder": tmp_path / "none", **known})
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_command(tmp_path, capsys):
+    from teaser_jax.cli import main
+
+    def run(*arguments):
+        code = main(["study", *map(str, arguments)])
+        return code, *capsys.readouterr()
+
+    code, out, _ = run("list")
+    assert code == 0
+    for name in studies():
+        assert name in out
+    code, out, err = run("translation", "--folder", tmp_path / "s", "--runs", 1, "--quick", "--method", "TLS")
+    assert code == 0
+    assert out.split() == [
+        str(tmp_path / "s" / "translation" / name) for name in ("table.csv", "figure.png", "figure.html")
+    ]
+    assert "100%" in err
+    assert run("report", "--folder", tmp_path / "s")[:2] == (0, f"{tmp_path / 's' / 'PAPER.md'}\n")
+    code, out, _ = run("scale", "--runs", 2, "--quick", "--export", tmp_path / "shards")
+    assert code == 0
+    assert len(list(read_trials(out.split()))) == 8
+    for wrong in (
+        ("nothing",),
+        ("scale", "--model", tmp_path / "none.ply"),
+        ("scale", "--runs", 0, "--folder", tmp_path),
+        ("scale", "-o", "x.md"),
+        ("scale", "--cluster", "here"),
+        ("scale", "--cluster", "127.0.0.1:1,2,2"),
+        ("report", "--folder", tmp_path / "none"),
+    ):
+        code, out, err = run(*wrong)
+        assert (code, out) == (2, "")
+        assert err.startswith("teaser-jax: ")
+        assert err.count("\n") == 1
