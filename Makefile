@@ -23,7 +23,7 @@ test slow notebooks: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
 test slow: export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow lint notebooks bench oldest newest wheel size clean
+.PHONY: help demo test slow lint notebooks bench studies oldest newest wheel size clean
 
 help: ## This list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -60,6 +60,10 @@ $(PEERS): pyproject.toml
 
 bench: $(PEERS) ## Run the benchmarks beside the peers, for instance: make bench ARGS="--quick --only speed"
 	@$(VENV)-peers/bin/python -m benchmarks $(ARGS)
+
+studies: $(PEERS) ## Run the paper's studies, which takes hours, and write benchmarks/PAPER.md
+	@$(VENV)-peers/bin/teaser-jax study all --folder benchmarks/studies $(ARGS)
+	@$(VENV)-peers/bin/teaser-jax study report --folder benchmarks/studies -o benchmarks/PAPER.md
 
 oldest: ## Test against the oldest supported packages
 	@rm -rf $(VENV)-oldest && $(PYTHON) -m venv $(VENV)-oldest

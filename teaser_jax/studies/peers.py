@@ -65,6 +65,12 @@ def _open3d() -> dict[str, Peer]:
 
 
 def _ransac(src: np.ndarray, dst: np.ndarray, bound: float, scale: float | None, *, iterations: int) -> Pose:
+    return Pose.from_matrix(_ransac_matrix(src, dst, bound, scale, iterations))
+
+
+def _ransac_matrix(
+    src: np.ndarray, dst: np.ndarray, bound: float, scale: float | None, iterations: int
+) -> np.ndarray:
     from open3d.pipelines import registration as r
 
     fit = r.TransformationEstimationPointToPoint(with_scaling=scale is None)
@@ -72,7 +78,7 @@ def _ransac(src: np.ndarray, dst: np.ndarray, bound: float, scale: float | None,
         _cloud(src), _cloud(dst), _row_with_row(len(src)), bound, fit, 3, [],
         r.RANSACConvergenceCriteria(iterations, CONFIDENCE),
     )  # fmt: skip
-    return Pose.from_matrix(found.transformation)
+    return np.array(found.transformation)
 
 
 def _ransac_in(
@@ -80,7 +86,8 @@ def _ransac_in(
 ) -> Pose:
     """RANSAC with a time-out, which Open3D does not have: as many iterations as fit into it."""
     start = time.perf_counter()
-    _ransac(src, dst, bound, scale, iterations=FIRST_ITERATIONS)
+    # On matches that are all wrong, for it stops early on right ones and would seem too fast.
+    _ransac_matrix(src, np.roll(dst, 1, axis=0), bound, scale, FIRST_ITERATIONS)
     rate = FIRST_ITERATIONS / (time.perf_counter() - start)
     return _ransac(src, dst, bound, scale, iterations=max(FIRST_ITERATIONS, int(rate * seconds)))
 
