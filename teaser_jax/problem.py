@@ -15,6 +15,8 @@ import numpy as np
 
 from teaser_jax.types import Problem
 
+MOST_CONFIDENCE = 1e9
+
 
 def make_problem(
     src: Any,
@@ -107,9 +109,16 @@ def stack_problems(problems: Sequence[Problem]) -> Problem:
     Raises:
         ValueError: If there are none, or scale or pairs are given in some but not in all.
     """
+    if isinstance(problems, Problem):
+        raise ValueError("stack_problems takes a list of problems, and received one Problem.")
     problems = list(problems)
     if not problems:
         raise ValueError("stack_problems received no problem.")
+    for k, p in enumerate(problems):
+        if not isinstance(p, Problem) or p.src.ndim != 2 or p.src.shape != p.dst.shape:
+            raise ValueError(
+                f"problem {k} of the list is no single Problem with as many rows in src as in dst."
+            )
     for name in ("scale", "pairs"):
         if len({getattr(p, name) is None for p in problems}) > 1:
             raise ValueError(f"some problems have {name}=None and some do not: stack each kind by itself.")
@@ -293,6 +302,8 @@ def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: A
         weights = confidence[mask]
         if not np.all((weights >= 0) & np.isfinite(weights)):
             raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
+        if np.any(weights > MOST_CONFIDENCE):  # sums of their products would overflow in float32
+            raise ValueError(f"confidence contains {weights.max():.3g}: divide them all, only ratios count.")
     if is_traced(src, dst, mask, noise_bound):
         return
     usable = finite_rows(src, dst, mask)

@@ -223,8 +223,16 @@ def check_settings(settings: Settings) -> None:
 def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
     """``make_problem`` in float64 numpy, from anything that can be read on the host: for ``solve_batch``.
 
-    Takes the arguments of ``make_problem`` and raises what it raises.
+    Args:
+        src, dst: (n, 3) matched points, row i with row i [length].
+        known: The other arguments of ``make_problem``: ``noise_bound`` [length], ``scale``, ``cbar2``,
+            ``mask``, ``confidence``, ``pairs``.
+
+    Raises:
+        ValueError: As ``make_problem``; inside jit, where ``make_problem`` is the function to use.
     """
+    if is_traced(src, dst, known):
+        raise ValueError("host_problem reads numbers on the host: inside jit use make_problem.")
     return read_problem(src, dst, dtype=np.dtype(np.float64), **known)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +19,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.solve import solve, usable_rows
+from teaser_jax.problem import is_traced
+from teaser_jax.solve import check_records, solve, usable_rows
 from teaser_jax.stages.gnc import gnc_cost, gnc_weights
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
 from teaser_jax.types import Pose, Problem, Settings, Solution, Status
@@ -90,7 +92,11 @@ def soft_solve(
         iterations: Cap on the fits.
 
     Returns:
-        The pose, the weights, and whether to trust them. Finite always.
+        The pose, the weights, and whether to trust them. Finite always. NOT_CONVERGED means more
+            ``iterations``, or inside jit a ``gnc_mu`` that is not above 0.
+
+    Raises:
+        ValueError: Outside jit for a ``gnc_mu`` that is not a finite number above 0; for a stack.
 
     Gradients: by the implicit function theorem, forward and reverse, in points, bounds, confidences,
     known scale, cbar2 and gnc_mu, of the pose and of the weights; second derivatives, too. Memory does not
@@ -100,6 +106,13 @@ def soft_solve(
 
     References: Yang, Antonante, Tzoumas, Carlone, RA-L 2020 (GNC-TLS); eq. (6).
     """
+    check_records(problem, settings)
+    if np.shape(gnc_mu) != () or (
+        not is_traced(gnc_mu) and not (np.isfinite(float(gnc_mu)) and float(gnc_mu) > 0)
+    ):
+        raise ValueError(f"gnc_mu is {gnc_mu}: expected one finite number above 0.")
+    if isinstance(iterations, bool) or not isinstance(iterations, Integral) or iterations < 1:
+        raise ValueError(f"iterations is {iterations!r}: expected a whole number, 1 or above.")
     start = solve(lax.stop_gradient(problem), lax.stop_gradient(settings))
     p, _ = usable_rows(problem)
     dtype = p.src.dtype
@@ -181,7 +194,7 @@ def _energy(step: Float[Array, " d"], data: _Data, pose: Pose) -> Float[Array, "
     scale = pose.scale if data.scale is None else data.scale
     if data.scale is None:
         scale = scale * (1 + step[6] + 0.5 * step[6] ** 2)  # e^x to second order
-    middle = _middle(data)
+    middle = _middle(data, pose)
     moved = pose.translation + pose.scale * so3.rotate(pose.rotation, middle[None])[0] + step[3:6]
     translation = moved - scale * so3.rotate(rotation, middle[None])[0]
     r2 = squared_residuals(Pose(rotation, translation, scale), data.src, data.dst, data.noise_bound)
@@ -194,10 +207,16 @@ def _turn(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=w.dtype) + skew + 0.5 * skew @ skew
 
 
-def _middle(data: _Data) -> Float[Array, "3"]:
-    """About which poses are varied: about a far origin, turns and shifts would all but coincide."""
-    weights = data.confidence / jnp.maximum(jnp.sum(data.confidence), jnp.finfo(data.src.dtype).tiny)
-    return lax.stop_gradient(jnp.sum(weights[:, None] * data.src, axis=0))
+def _middle(data: _Data, pose: Pose) -> Float[Array, "3"]:
+    """About which poses are varied: about a far origin, turns and shifts would all but coincide.
+
+    Of the matches that count at the pose: a wrong one may be as far away as it likes.
+    """
+    data, pose = lax.stop_gradient((data, pose))
+    r2 = squared_residuals(pose, data.src, data.dst, data.noise_bound)
+    weights = data.confidence * gnc_weights(r2, data.gnc_mu, data.cbar2)
+    weights = weights / jnp.maximum(jnp.sum(weights), jnp.finfo(data.src.dtype).tiny)
+    return jnp.sum(jnp.where(weights > 0, weights, 0)[:, None] * data.src, axis=0)
 
 
 def _curvature(data: _Data, pose: Pose) -> _Curvature:
@@ -225,7 +244,7 @@ def _moved(pose: Pose, step: Float[Array, " d"], data: _Data) -> Pose:
     half_turn = jnp.concatenate([0.5 * step[:3], jnp.ones_like(step[:1])])
     rotation = pose.rotation @ so3.rotation_from_quat(half_turn)
     scale = pose.scale if data.scale is not None else pose.scale * jnp.exp(step[6])
-    middle = _middle(data)[None]
+    middle = _middle(data, pose)[None]
     place = pose.scale * so3.rotate(pose.rotation, middle) - scale * so3.rotate(rotation, middle)
     return Pose(rotation, pose.translation + step[3:6] + place[0], scale)
 
@@ -247,7 +266,7 @@ def _stationary_jvp(iterations: int, primals: tuple, tangents: tuple) -> tuple[A
         d_scale = pose.scale * step[6]
     else:
         d_scale = jnp.where(curvature.determined, d_data.scale, 0)
-    middle = _middle(data)[None]
+    middle = _middle(data, pose)[None]
     turned = pose.scale * so3.rotate(d_rotation, middle) + d_scale * so3.rotate(pose.rotation, middle)
     d_pose = Pose(d_rotation, step[3:6] - turned[0], d_scale)
     nothing = np.zeros((), jax.dtypes.float0)

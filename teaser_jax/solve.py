@@ -65,20 +65,35 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
     Returns:
         The pose from the source to the target frame and what it rests on. Finite always.
 
+    Raises:
+        ValueError: On anything but one ``Problem`` and ``Settings``.
+
     Gradients: exact through ``refit`` as long as the chosen sets do not change, that is almost
     everywhere; the sets themselves carry none (``soft_solve`` differentiates through them, too). Zero
     where the rotation is ambiguous, and then the status is not OK.
 
     References: Yang, Shi, Carlone, T-RO 2020, Algorithm 1 with MCIS (section VI-D) and GNC.
     """
-    if problem.src.ndim != 2:
-        raise ValueError(
-            f"src has shape {problem.src.shape}: solve takes one problem; use jax.vmap(solve) for a stack."
-        )
+    check_records(problem, settings)
     frozen = lax.stop_gradient(problem)
     graph = prepare(frozen, settings)
     clique = find_clique(frozen, graph, settings)
     return conclude(problem, graph, clique, settings)
+
+
+def check_records(problem: Any, settings: Any) -> None:
+    """ValueError unless these are one problem and settings."""
+    if not isinstance(problem, Problem):
+        raise ValueError(
+            f"received {type(problem).__name__} for a problem: make one with make_problem(src, dst, "
+            "noise_bound=...)."
+        )
+    if not isinstance(settings, Settings):
+        raise ValueError(f"settings is {settings!r}: expected Settings, as in Settings(clique='greedy').")
+    if problem.src.ndim != 2:
+        raise ValueError(
+            f"src has shape {problem.src.shape}: expected one problem; use jax.vmap(solve) for a stack."
+        )
 
 
 def select(problem: Problem, settings: Settings = Settings()) -> Selection:
@@ -88,6 +103,7 @@ def select(problem: Problem, settings: Settings = Settings()) -> Selection:
 
     Gradients: none, the sets are choices. Differentiate ``refit``.
     """
+    check_records(problem, settings)
     frozen = lax.stop_gradient(problem)
     graph = prepare(frozen, settings)
     return choose(frozen, graph, find_clique(frozen, graph, settings), settings)[0]
@@ -252,9 +268,30 @@ def refit(problem: Problem, selection: Selection) -> Pose:
     Refined selections give the weighted similarity fit over ``inliers``; others give (11) - (13)
     on the frozen sets with binary weights. Weights are confidence_i / beta_i^2.
 
+    Args:
+        problem: One problem; ``jax.vmap`` takes stacks.
+        selection: Of that problem, as in ``solution.selection``: sets in the order of its rows.
+
+    Raises:
+        ValueError: If they do not belong together.
+
     Gradients: exact in points, bounds, known scale and confidences; memory O(n) (complete TIM
     graphs and voted scales: one slice of the pairs at a time). Zero where the rotation is ambiguous.
     """
+    check_records(problem, Settings())
+    if not isinstance(selection, Selection):
+        raise ValueError(
+            f"refit takes a Selection, received {type(selection).__name__}: give solution.selection."
+        )
+    if jnp.shape(selection.inliers) != problem.src.shape[:1]:
+        raise ValueError(
+            f"src has shape {problem.src.shape} and the selection {jnp.shape(selection.inliers)} rows: "
+            "expected the selection of the same problem."
+        )
+    if problem.scale is None and selection.scale_pairs is None:
+        raise ValueError(
+            "the selection was made with a known scale, and the problem has none: give its scale."
+        )
     return lax.cond(
         selection.refined,
         lambda: _refit(problem, selection, refined=True),
@@ -276,7 +313,7 @@ def _refit(problem: Problem, selection: Selection, *, refined: bool) -> Pose:
     if p.scale is not None:
         scale = p.scale
     else:
-        assert selection.scale_pairs is not None, "the selection was made with a known scale"
+        assert selection.scale_pairs is not None
         scale = _positive(
             scale_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, selection.scale_pairs, pairs=p.pairs)
         )

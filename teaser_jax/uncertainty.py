@@ -13,7 +13,8 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.problem import is_traced
@@ -80,11 +81,17 @@ def covariance(
         Covariance and information. Pure under jit and vmap; outside, numpy problems give numpy in float64.
 
     Raises:
-        ValueError: For another convention, a stack, or a ``sigma`` of the wrong shape or below 0.
+        ValueError: For another convention, a stack, anything but a ``Solution``, or a ``sigma`` of the wrong
+            shape or below 0.
 
     Gradients: exact, through the second derivative of the fit.
     """
     _check_convention(convention)
+    if not isinstance(solution, Solution):
+        raise ValueError(
+            f"covariance takes the Solution of solve, received {type(solution).__name__}: of a Registration "
+            "or a SoftSolution give its .solution."
+        )
     if problem.src.ndim != 2 or np.shape(solution.inliers) != problem.src.shape[:1]:
         raise ValueError(
             f"covariance takes one problem and its solution, received src of shape {problem.src.shape} and "
@@ -106,17 +113,25 @@ def pose_difference(
     ``error @ information @ error`` is the normalised error squared, which should follow chi^2.
 
     Args:
-        pose, truth: The answer, and what it should be.
+        pose, truth: The answer, and what it should be: one pose each; ``jax.vmap`` for more.
         convention: As for ``covariance``.
         with_scale: Append log(s' / s).
 
+    Returns:
+        In radians and the unit of the target, in the order of the convention.
+
     Raises:
-        ValueError: For another convention.
+        ValueError: For another convention, or stacks of poses.
 
     Gradients: exact, but where the rotations are opposite and the axis of the turn jumps.
     """
     _check_convention(convention)
     pose, truth = (jax.tree.map(jnp.asarray, x) for x in (pose, truth))
+    if pose.rotation.shape != (3, 3) or truth.rotation.shape != (3, 3):
+        raise ValueError(
+            f"the rotations have shapes {pose.rotation.shape} and {truth.rotation.shape}: expected one pose "
+            "each, (3, 3); use jax.vmap for stacks."
+        )
     between = jnp.einsum("ji,jk->ik", pose.rotation, truth.rotation, precision=jax.lax.Precision.HIGHEST)
     quat = so3.quat_from_rotation(between)
     sine = safe_norm(quat[:3])
@@ -136,6 +151,8 @@ def _check_convention(convention: Any) -> None:
 
 def _checked(sigma: Any, problem: Problem) -> Any:
     n = problem.src.shape[:-1]
+    if isinstance(sigma, str):
+        raise ValueError(f"sigma is {sigma!r}: expected a standard deviation; convention=... has its name.")
     if np.shape(sigma) not in ((), n):
         raise ValueError(f"sigma has shape {np.shape(sigma)}: expected one number, or one a match, {n}.")
     if not is_traced(sigma) and not np.all(np.asarray(sigma, float) >= 0):
@@ -148,29 +165,56 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
     p, _ = usable_rows(problem)
     pose = jax.tree.map(jnp.asarray, solution.pose)
     deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)
-    to_first_order = lambda dst: _coordinates(refit(replace(p, dst=dst), solution.selection), pose, p)
-    slope = jax.jacrev(to_first_order)(p.dst)  # (d, n, 3)
+    # About the inliers' middle, where turns and shifts hardly depend on each other: about a far origin the
+    # one all but determines the other, and their information could not be told from an infinite one.
+    middle = lax.stop_gradient(_middle(p, solution.inliers))
+    here = lax.stop_gradient(pose.apply(middle[None])[0])
+    about = replace(pose, translation=jnp.zeros_like(pose.translation))
+    near = replace(p, src=p.src - middle, dst=p.dst - here)
+    to_first_order = lambda dst: _coordinates(refit(replace(near, dst=dst), solution.selection), about, p)
+    slope = jax.jacrev(to_first_order)(near.dst)  # (d, n, 3)
     deviation = jnp.broadcast_to(deviation, p.mask.shape)
     weighted = slope * jnp.where(p.mask & jnp.isfinite(deviation), deviation, 0)[:, None]
-    right = jnp.einsum("ani,bni->ab", weighted, weighted, precision=jax.lax.Precision.HIGHEST)
-    change = _change(pose, len(right), convention)
-    found = change @ right @ change.T
+    found = jnp.einsum("ani,bni->ab", weighted, weighted, precision=lax.Precision.HIGHEST)
     eye = jnp.eye(len(found), dtype=found.dtype)
     sensible = jnp.all(jnp.where(solution.inliers, jnp.isfinite(deviation) & (deviation >= 0), True))
     known = solution.ok & jnp.all(jnp.isfinite(found)) & sensible
     # Angles and lengths may be of very different size: invert in units of the deviations.
     spread = jnp.diagonal(found)
-    unit = jax.lax.rsqrt(jnp.where(known & (spread > 0), spread, 1))
+    unit = lax.rsqrt(jnp.where(known & (spread > 0), spread, 1))
     normalised = jnp.where(known, unit[:, None] * found * unit, eye)
-    least = jnp.linalg.eigvalsh(jax.lax.stop_gradient(normalised))[0]
+    least = jnp.linalg.eigvalsh(lax.stop_gradient(normalised))[0]
     exact = least <= 8 * jnp.finfo(found.dtype).eps  # some combination of coordinates has no noise at all
     inverse = unit[:, None] * jnp.linalg.inv(jnp.where(exact, eye, normalised)) * unit
     infinite = jnp.where(eye > 0, jnp.inf, 0)
+    to_origin = _moved_origin(middle * pose.scale, len(found))
+    from_origin = _moved_origin(-middle * pose.scale, len(found))
+    change = _change(pose, len(found), convention)
+    forth = _product(change, to_origin)
+    back = _product(from_origin, jnp.linalg.inv(change))
+    covariance = _product(_product(forth, jnp.where(known, found, 0)), forth.T)
+    information = _product(_product(back.T, jnp.where(known & ~exact, inverse, 0)), back)
     return Uncertainty(
-        covariance=jnp.where(known, found, infinite),
-        information=jnp.where(known, jnp.where(exact, infinite, inverse), 0),
+        covariance=jnp.where(known, covariance, infinite),
+        information=jnp.where(known, jnp.where(exact, infinite, information), 0),
         convention=convention,
     )
+
+
+def _middle(p: Problem, inliers: Bool[Array, " n"]) -> Float[Array, "3"]:
+    weights = jnp.where(jnp.asarray(inliers), p.confidence, 0)
+    total = jnp.maximum(jnp.sum(weights), jnp.finfo(weights.dtype).tiny)
+    return jnp.sum((weights / total)[:, None] * p.src, axis=0)
+
+
+def _moved_origin(shift: Float[Array, "3"], d: int) -> Float[Array, "d d"]:
+    """From errors of a pose at a point to those at the origin, ``shift`` before it, in axes of the source."""
+    found = jnp.eye(d, dtype=shift.dtype).at[3:6, :3].set(so3.hat(shift))
+    return found if d == 6 else found.at[3:6, 6].set(-shift)
+
+
+def _product(a: Array, b: Array) -> Array:
+    return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
 def _coordinates(pose: Pose, about: Pose, problem: Problem) -> Float[Array, " d"]:

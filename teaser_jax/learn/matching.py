@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -52,7 +53,8 @@ def match(
         finite, are masked and have confidence 0.
 
     Raises:
-        ValueError: On shapes that do not fit, no target, or a temperature that is not above 0.
+        ValueError: On shapes that do not fit, no target, masks that are not boolean, or a temperature that
+            is not above 0.
 
     Gradients: of the confidences, exact; the counterparts and the mask are choices and have none.
 
@@ -60,15 +62,15 @@ def match(
     """
     _check(src_descriptors, dst_descriptors, temperature)
     n = len(src_descriptors)
-    src_descriptors, src_mask = _finite(src_descriptors, src_mask)
-    dst_descriptors, dst_mask = _finite(dst_descriptors, dst_mask)
+    src_descriptors, src_mask = finite_rows(src_descriptors, src_mask)
+    dst_descriptors, dst_mask = finite_rows(dst_descriptors, dst_mask)
     similarity = similarities(src_descriptors, dst_descriptors) / temperature
     either = src_mask[:, None] & dst_mask
-    similarity = jnp.where(either, similarity, _least(similarity))
+    similarity = jnp.where(either, similarity, least(similarity))
     counterpart = jnp.argmax(lax.stop_gradient(similarity), axis=1)
     best = jnp.take_along_axis(similarity, counterpart[:, None], axis=1)[:, 0]
     log_confidence = (
-        2 * best - _log_sum(similarity, axis=1) - jnp.take(_log_sum(similarity, axis=0), counterpart)
+        2 * best - log_sum(similarity, axis=1) - jnp.take(log_sum(similarity, axis=0), counterpart)
     )
     usable = src_mask & jnp.take(dst_mask, counterpart)
     mask = usable
@@ -88,15 +90,22 @@ def soft_counterparts(
 ) -> Float[Array, "n 3"]:
     """A virtual counterpart of each source point: the mean of the target, weighted by softmax(S).
 
+    Target points that are masked or not finite have no weight; where none is left the answer is the origin.
+    A source point whose descriptor is not finite resembles all of them alike: mask its match.
+
+    Raises:
+        ValueError: As ``match``.
+
     Gradients: exact, also in ``dst`` and the descriptors, which is what the hard choice of ``match`` lacks.
 
     References: Wang, Solomon, Deep Closest Point, ICCV 2019.
     """
     _check(src_descriptors, dst_descriptors, temperature)
-    src_descriptors, _ = _finite(src_descriptors, None)
-    dst_descriptors, dst_mask = _finite(dst_descriptors, dst_mask)
+    src_descriptors, _ = finite_rows(src_descriptors, None)
+    dst_descriptors, dst_mask = finite_rows(dst_descriptors, dst_mask)
+    dst_mask &= jnp.all(jnp.isfinite(dst), axis=1)
     similarity = similarities(src_descriptors, dst_descriptors) / temperature
-    similarity = jnp.where(dst_mask, similarity, _least(similarity))
+    similarity = jnp.where(dst_mask, similarity, least(similarity))
     dst = jnp.where(dst_mask[:, None], dst, 0)
     return jnp.matmul(jax.nn.softmax(similarity, axis=1), dst, precision=lax.Precision.HIGHEST)
 
@@ -108,25 +117,46 @@ def _check(src_descriptors: Array, dst_descriptors: Array, temperature: Any) -> 
             f"descriptors have shapes {shapes[0]} and {shapes[1]}: expected (n, d) and (m, d), one or "
             "more each; use jax.vmap for batches."
         )
-    if not is_traced(temperature) and not float(temperature) > 0:
-        raise ValueError(f"temperature is {temperature}: expected a number above 0.")
+    check_positive(temperature=temperature)
 
 
-def _finite(descriptors: Array, mask: Array | None) -> tuple[Array, Array]:
+def finite_rows(descriptors: Array, mask: Array | None) -> tuple[Array, Array]:
     """Descriptors made harmless before anything is computed from them, and which of them are to be used."""
-    finite = jnp.all(jnp.isfinite(descriptors), axis=1)
-    mask = finite if mask is None else mask & finite
+    mask = as_mask(mask, descriptors.shape[:1]) & jnp.all(jnp.isfinite(descriptors), axis=1)
     return jnp.where(mask[:, None], descriptors, 0), mask
 
 
 def as_float(x: Any) -> Array:
-    """Integers become float32, floats stay what they are."""
+    """At least float32: integers would cut bounds, and half precision has no linear algebra."""
     x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(jnp.float32)
+    if jnp.issubdtype(x.dtype, jnp.complexfloating):
+        raise ValueError("complex numbers were received: points are real.")
+    return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+
+
+def as_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Array, "..."]:
+    """A mask of that shape; None: everything. ValueError for numbers, which would weigh instead of choose."""
+    if mask is None:
+        return jnp.ones(shape, bool)
+    mask = jnp.asarray(mask)
+    if mask.dtype != bool or mask.shape != shape:
+        raise ValueError(f"a mask has shape {mask.shape} and type {mask.dtype}: expected {shape} and bool.")
+    return mask
+
+
+def check_positive(**numbers: Any) -> None:
+    """ValueError for those outside jit that are not finite and above 0; inside, values are not known."""
+    for name, value in numbers.items():
+        if is_traced(value):
+            continue
+        given = np.asarray(value, float)
+        if not (np.isfinite(given).all() and (given > 0).all()):
+            raise ValueError(f"{name} is {value}: expected a finite number above 0.")
 
 
 def centred(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Array, "n 3"]:
     """About the mean of the points under the mask; the others at the origin."""
+    points = jnp.where(mask[:, None], points, 0)  # what is masked may be anything
     present = mask.astype(points.dtype)[:, None]
     mean = jnp.sum(present * points, axis=0) / jnp.maximum(jnp.sum(present), 1)
     return present * (points - mean)
@@ -137,12 +167,12 @@ def similarities(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array,
     return jnp.matmul(a, b.T, precision=lax.Precision.HIGHEST)
 
 
-def _log_sum(x: Array, axis: int) -> Array:
-    # As jax.nn.logsumexp, at a fifth of its time with gradient: the shift needs none.
+def log_sum(x: Array, axis: int) -> Array:
+    """As ``jax.nn.logsumexp``, at a fifth of its time with gradient: the shift needs none."""
     top = lax.stop_gradient(jnp.max(x, axis=axis, keepdims=True))
     return jnp.log(jnp.sum(jnp.exp(x - top), axis=axis)) + jnp.squeeze(top, axis)
 
 
-def _least(x: Array) -> Array:
+def least(x: Array) -> Array:
     """So little that its exponential is nothing, yet a number, so that no gradient is NaN."""
     return jnp.asarray(-0.5 * jnp.finfo(x.dtype).max, x.dtype)

@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from teaser_jax.learn.matching import as_float, centred, similarities
+from teaser_jax.learn.matching import as_float, as_mask, centred, check_positive, similarities
 
 BINS = 5
 PREFERENCE = 0.01  # for the direction to the sensor as a normal, against a spread of the radius squared
@@ -42,7 +42,6 @@ class Scan(NamedTuple):
     reach: Float[Array, "*batch"]
 
 
-@jax.jit
 def read_scan(
     points: Float[Array, "n 3"],
     viewpoint: Float[Array, "3"],
@@ -55,20 +54,36 @@ def read_scan(
     Args:
         points: A scan [length].
         viewpoint: Where the sensor stood, in the frame of the scan; it tells outside from inside.
-        mask: Points that exist; None: all. Points that are not finite are masked.
+        mask: Points that exist; None: all. Points that are not finite, and those without a neighbour within
+            reach, of which nothing can be said, are masked.
         reach: How far a neighbour can be [length]: a third of an object.
+
+    Raises:
+        ValueError: On shapes that do not fit (``jax.vmap`` takes batches), or a reach that is not above 0.
 
     Gradients: none; the scan is data.
 
     References: Drost et al., CVPR 2010 (pairs of oriented points); Rusu et al., ICRA 2009 (histograms).
     """
-    points, viewpoint = lax.stop_gradient((as_float(points), as_float(viewpoint)))
-    mask = jnp.ones(len(points), bool) if mask is None else mask
+    points, viewpoint = as_float(points), as_float(viewpoint)
+    if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):
+        raise ValueError(
+            f"points have shape {points.shape} and the viewpoint {viewpoint.shape}: expected (n, 3) and "
+            "(3,); use jax.vmap for batches."
+        )
+    check_positive(reach=reach)
+    return _read_scan(points, viewpoint, as_mask(mask, points.shape[:1]), jnp.asarray(reach, points.dtype))
+
+
+@jax.jit
+def _read_scan(points: Array, viewpoint: Array, mask: Array, reach: Array) -> Scan:
+    points, viewpoint = lax.stop_gradient((points, viewpoint))
     mask &= jnp.all(jnp.isfinite(points), axis=1)  # one NaN would reach every mean
     points = jnp.where(mask[:, None], points, 0)
     difference = points[None] - points[:, None]
     distance = jnp.sqrt(jnp.sum(difference**2, axis=2))
     pairs = mask[:, None] & mask & ~jnp.eye(len(points), dtype=bool)
+    mask &= jnp.any(pairs & (distance < reach), axis=1)
     radius = LEVELS[0] * reach
     normals = _normals(points, viewpoint, mask, pairs & (distance < radius), radius)
     direction = difference / jnp.where(distance > 0, distance, 1)[..., None]
@@ -84,13 +99,22 @@ def read_scan(
         near = near / jnp.maximum(jnp.sum(near, axis=1, keepdims=True), 1)
         lengths = _soft_bins(distance / (level * reach), 0.0, 1.0)
         found += [jnp.einsum("ij,ijm->im", near, x) for x in (angles, lengths)]
-    return Scan(points, jnp.concatenate(found, axis=1), mask, jnp.asarray(reach, points.dtype))
+    return Scan(points, jnp.concatenate(found, axis=1), mask, reach)
 
 
 def init_network(
     key: PRNGKeyArray, *, width: int = 64, messages: int = 24, layers: int = 3, size: int = 24
 ) -> Parameters:
-    """Random weights, as a pytree: ``width`` numbers a point inside, ``size`` in its descriptor."""
+    """Random weights, as a pytree: ``width`` numbers a point inside, ``size`` in its descriptor.
+
+    Raises:
+        ValueError: If one of these numbers is below 1 (``layers``: below 0).
+    """
+    if min(width, messages, size) < 1 or layers < 0:
+        raise ValueError(
+            f"width = {width}, messages = {messages}, size = {size}, layers = {layers}: expected 1 or more, "
+            "layers 0 or more."
+        )
     keys = iter(jax.random.split(key, 3 + 3 * layers))
     heard = width + messages * len(LEVELS)
     return {
@@ -107,7 +131,7 @@ def init_network(
 
 
 def describe(parameters: Parameters, scan: Scan) -> Float[Array, "n d"]:
-    """Descriptors of length 1, the same in every frame; those of masked points mean nothing.
+    """Descriptors of length 1 (to 1e-6), the same in every frame; those of masked points mean nothing.
 
     Gradients: exact in the parameters.
     """
@@ -120,7 +144,8 @@ def describe(parameters: Parameters, scan: Scan) -> Float[Array, "n d"]:
         state = state + _normalise(_perceptron(layer["think"], jnp.concatenate(heard, axis=1)))
         states.append(state)
     found = _apply(parameters["leave"], jnp.concatenate(states, axis=1))
-    return found * lax.rsqrt(jnp.sum(found * found, axis=1, keepdims=True) + 1e-12)
+    # A point that hears nothing has no direction: its length stays 0, and its slope bounded.
+    return found * lax.rsqrt(jnp.sum(found * found, axis=1, keepdims=True) + 1e-6)
 
 
 def _dense(key: PRNGKeyArray, inputs: int, outputs: int) -> dict[str, Array]:

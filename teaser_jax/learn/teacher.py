@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from teaser_jax.learn.matching import as_float
+from teaser_jax.learn.matching import as_float, check_positive
 from teaser_jax.problem import make_problem
 from teaser_jax.solve import solve
 from teaser_jax.types import Pose, Settings
@@ -69,7 +69,8 @@ def teacher(
         Labels with the batch axes of ``src``.
 
     Raises:
-        ValueError: On shapes that do not fit.
+        ValueError: On shapes that do not fit, and on bounds outside jit that are not above 0. Other numbers
+            that make no sense end in a status, pair by pair.
 
     Gradients: none, on purpose; differentiate ``solve`` or ``soft_solve`` to learn through the solver.
 
@@ -84,6 +85,12 @@ def teacher(
         raise ValueError(f"least_inliers has shape {jnp.shape(least_inliers)}: expected one number.")
     src, dst = as_float(src), as_float(dst)  # integers would cut the bound
     batch = src.shape[:-1]
+    check_positive(noise_bound=noise_bound)
+    if jnp.shape(noise_bound) not in ((), batch[-1:], batch):
+        raise ValueError(
+            f"noise_bound has shape {jnp.shape(noise_bound)}: expected one number, or one a match, "
+            f"{batch[-1:]} or {batch}."
+        )
     mask = jnp.ones(batch, bool) if mask is None else jnp.broadcast_to(mask, batch)
     confidence = jnp.ones(batch, src.dtype) if confidence is None else jnp.broadcast_to(confidence, batch)
     bound = jnp.broadcast_to(jnp.asarray(noise_bound, src.dtype), batch)

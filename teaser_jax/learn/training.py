@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from teaser_jax.learn.losses import masked_mean, matching_loss, rotation_loss
-from teaser_jax.learn.matching import match
+from teaser_jax.learn.matching import check_positive, match
 from teaser_jax.learn.network import Parameters, Scan, describe, read_scan
 from teaser_jax.learn.teacher import Labels, teacher
 from teaser_jax.types import Pose
@@ -50,6 +50,7 @@ class History(NamedTuple):
     angle: Float[Array, "steps batch"]
 
 
+LEAST_POINTS = 5  # right matches: the least that a status can call OK
 Teach = Callable[[Parameters, Pairs, float], Labels]  # network, a batch, noise bound
 
 
@@ -57,11 +58,16 @@ def read_pairs(pairs: Any, *, reach: float = 0.32) -> Pairs:
     """Pairs for training from ``synthetic.ScanPair`` or anything with its fields, all of one size.
 
     Raises:
-        ValueError: If there are none.
+        ValueError: If there are none, or they differ in size.
     """
     pairs = list(pairs)
     if not pairs:
         raise ValueError("read_pairs received no pair.")
+    sizes = {np.shape(points) for p in pairs for points in (p.src, p.dst)}
+    if len({np.shape(p.src) for p in pairs}) > 1 or len({np.shape(p.dst) for p in pairs}) > 1:
+        raise ValueError(
+            f"scans have shapes {sorted(sizes)}: expected one for all, so that they can be stacked."
+        )
 
     def read(points: list, viewpoints: list) -> Scan:
         both = jnp.asarray(np.stack(points), jnp.float32), jnp.asarray(np.stack(viewpoints), jnp.float32)
@@ -112,7 +118,6 @@ def truth_labels(parameters: Parameters, pairs: Pairs, noise_bound: float) -> La
     return Labels(pairs.truth, nothing, jnp.ones(batch, bool), jnp.zeros(batch, jnp.int32))
 
 
-@partial(jax.jit, static_argnames=("optimizer", "steps", "batch", "points", "labels"))
 def train(
     parameters: Parameters,
     pairs: Pairs,
@@ -146,13 +151,42 @@ def train(
         The trained parameters, and what happened.
 
     Raises:
-        ValueError: If sources and targets differ in number, or nothing would be drawn.
+        ValueError: If sources and targets differ in number, nothing would be drawn, so few points that no
+            pose could be trusted, or a bound, radius or temperature outside jit that is not above 0.
     """
+    check_positive(noise_bound=noise_bound, radius=radius, temperature=temperature)
+    if not isinstance(pairs, Pairs) or pairs.src.mask.ndim != 2:
+        raise ValueError("pairs are not a stack of scans: make them with read_pairs.")
     count, n = pairs.src.mask.shape
     if pairs.dst.mask.shape[0] != count:
         raise ValueError(f"{count} sources and {pairs.dst.mask.shape[0]} targets: pairs need one of each.")
-    if min(points, batch, steps) < 1:
-        raise ValueError(f"received points = {points}, batch = {batch}, steps = {steps}: expected 1 or more.")
+    if min(count, batch, steps) < 1 or points < LEAST_POINTS:
+        raise ValueError(
+            f"received {count} pairs, points = {points}, batch = {batch}, steps = {steps}: expected 1 or "
+            f"more, and {LEAST_POINTS} points, the least that can be trusted."
+        )
+    return _train(
+        parameters, pairs, key, noise_bound, radius, temperature,
+        optimizer=optimizer, steps=steps, batch=batch, points=points, labels=labels,
+    )  # fmt: skip
+
+
+@partial(jax.jit, static_argnames=("optimizer", "steps", "batch", "points", "labels"))
+def _train(
+    parameters: Parameters,
+    pairs: Pairs,
+    key: PRNGKeyArray,
+    noise_bound: Any,
+    radius: Any,
+    temperature: Any,
+    *,
+    optimizer: Any,
+    steps: int,
+    batch: int,
+    points: int,
+    labels: Teach,
+) -> tuple[Parameters, History]:
+    count, n = pairs.src.mask.shape
     drawn_src, drawn_dst = min(points, n), min(points, pairs.dst.mask.shape[1])
 
     def loss(parameters: Parameters, drawn: Pairs, taught: Labels) -> Array:
