@@ -107,3 +107,81 @@ def test_nothing_to_learn_from_is_zero_with_gradient_zero():
         value, slope = jax.value_and_grad(loss)(a)
         assert value == 0
         np.testing.assert_array_equal(slope, 0)
+
+
+def unit_rows(seed: int, n: int = 10) -> np.ndarray:
+    rows = np.random.default_rng(seed).normal(size=(n, 8)).astype(np.float32)
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("temperature", [0.1, 0.01, 0.001])
+def test_the_contrastive_loss_is_exact_at_every_temperature(temperature):
+    points = np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
+    one = tj.Pose(np.eye(3), np.zeros(3), np.asarray(1.0))
+    a, b = unit_rows(0), unit_rows(1)
+    scores = (a.astype(float) @ b.astype(float).T) / temperature
+    total = lambda axis: scores.max(axis) + np.log(np.exp(scores - scores.max(axis, keepdims=True)).sum(axis))
+    both = [np.mean(total(axis) - np.diagonal(scores)) for axis in (0, 1)]
+    loss = lambda x: learn.matching_loss(x, b, points, points, one, radius=1e-3, temperature=temperature)
+    assert loss(a) == pytest.approx(np.mean(both), rel=1e-4)
+    assert np.isfinite(jax.grad(loss)(a)).all()
+
+
+def test_points_that_are_masked_or_no_numbers_do_not_count():
+    points = np.random.default_rng(0).normal(size=(10, 3)).astype(np.float32)
+    one = tj.Pose(np.eye(3), np.zeros(3), np.asarray(1.0))
+    a, b = unit_rows(0), unit_rows(1)
+    broken, odd, some = points.copy(), a.copy(), np.arange(10) > 0
+    broken[0], odd[0] = np.nan, np.inf
+    loss = lambda x, src, **known: learn.matching_loss(x, b, src, points, one, radius=0.01, **known)
+    expected = loss(a, points, src_mask=some)
+    assert expected > 0
+    assert loss(a, broken, src_mask=some) == expected
+    assert loss(a, broken) == expected
+    assert loss(odd, points) == expected
+
+
+def test_losses_of_what_is_no_number_are_none():
+    one = tj.Pose(np.eye(3), np.zeros(3), np.asarray(1.0))
+    lost = tj.Pose(np.full((3, 3), np.nan), np.full(3, np.nan), np.asarray(np.nan))
+    points = np.ones((4, 3), np.float32)
+    assert np.isnan(learn.rotation_loss(lost, one))
+    assert np.isnan(learn.translation_loss(lost, one))
+    assert np.isnan(learn.point_loss(lost, one, points))
+    assert np.isnan(learn.point_loss(one, one, np.nan * points))
+    assert np.isnan(learn.keypoint_loss(points, points, lost, noise_bound=0.1))
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.float16, np.float32])
+@pytest.mark.parametrize("far", [0, 3, 1e4])
+def test_keypoints_of_every_type_and_distance(kind, far):
+    one = tj.Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.float32(1))
+    src = np.zeros((5, 3), kind)
+    loss = lambda dst: learn.keypoint_loss(src, dst, one, noise_bound=0.5)
+    dst = src + np.asarray(far, kind)
+    assert loss(dst) == pytest.approx(3 * far**2 / (0.25 + 3 * far**2), rel=1e-3)
+    assert np.isfinite(jax.grad(loss)(dst.astype(np.float32))).all()
+
+
+def test_impossible_numbers_are_refused():
+    one = tj.Pose(np.eye(3), np.zeros(3), np.asarray(1.0))
+    points, a = np.ones((4, 3), np.float32), unit_rows(0, 4)
+    weights = np.full(4, 0.5, np.float32)
+    for wrong in (
+        lambda: learn.keypoint_loss(points, points, one, noise_bound=0.0),
+        lambda: learn.keypoint_loss(points, points[:1], one, noise_bound=1.0),
+        lambda: learn.keypoint_loss(points, points, one, noise_bound=1.0, mask=weights),
+        lambda: learn.point_loss(one, one, points, weights),
+        lambda: learn.matching_loss(a, a, points, points, one, radius=-1.0),
+        lambda: learn.matching_loss(a, a, points, points, one, radius=1.0, temperature=0.0),
+        lambda: learn.matching_loss(a, a, points, points, one, radius=1.0, src_mask=weights),
+        lambda: learn.soft_counterparts(a, a, points, dst_mask=np.ones(1, bool)),
+        lambda: learn.teacher(points[None], points[None], noise_bound=-1.0),
+        lambda: learn.teacher(np.stack([points] * 2), np.stack([points] * 2), noise_bound=np.ones(2)),
+        lambda: learn.read_scan(points, np.ones(3), reach=0.0),
+        lambda: learn.read_scan(points.T, np.ones(3)),
+        lambda: learn.read_scan(points, np.ones((1, 3))),
+        lambda: learn.init_network(jax.random.key(0), width=0),
+    ):
+        with pytest.raises(ValueError, match="expected"):
+            wrong()

@@ -148,3 +148,41 @@ def test_pairs_that_do_not_fit_are_refused(pairs):
         learn.train(network, pairs, jax.random.key(0), optimizer=OPTIMIZER, steps=1, points=0)
     with pytest.raises(ValueError, match="no true poses"):
         learn.truth_labels(network, pairs._replace(truth=None), 0.05)
+
+
+def test_a_point_alone_is_masked_and_bends_no_slope():
+    """Its descriptor had length zero and a slope of a million: training never recovered."""
+    pair = synthetic.scan_pair(0, synthetic.teapot(20_000), n=40, sigma=0.0)
+    network = learn.init_network(jax.random.key(0))
+    slopes = []
+    for points in (pair.src, np.concatenate([pair.src[:-1], [[9.0, 9, 9]]])):
+        scan = scan_of(points, pair.src_viewpoint, reach=1.0)
+        pose = learn.truth_labels(None, pairs_of(pair), 0.1).pose
+        pose = jax.tree.map(lambda x: x[0], pose)
+
+        def loss(parameters, scan=scan, pose=pose):
+            found = learn.describe(parameters, scan)
+            return learn.matching_loss(
+                found, found, scan.points, scan.points, pose.inverse() @ pose, radius=0.02, src_mask=scan.mask
+            )
+
+        slopes.append(optax.tree.norm(jax.grad(loss)(network)))
+    assert not scan.mask[-1]
+    assert scan.mask[:-1].all()
+    assert slopes[1] < 3 * slopes[0]
+
+
+def pairs_of(pair) -> learn.Pairs:
+    return learn.read_pairs([pair])
+
+
+def test_training_on_nonsense_is_refused(pairs):
+    network, key = learn.init_network(jax.random.key(0)), jax.random.key(1)
+    known = {"optimizer": optax.sgd(0.01), "steps": 1, "batch": 2}
+    for wrong in ({"radius": -1.0}, {"noise_bound": float("nan")}, {"temperature": 0.0}, {"points": 3}):
+        with pytest.raises(ValueError, match="expected"):
+            learn.train(network, pairs, key, **known, **wrong)
+    other = synthetic.scan_pair(1, synthetic.teapot(20_000), n=SIZE - 1)
+    same = synthetic.scan_pair(1, synthetic.teapot(20_000), n=SIZE)
+    with pytest.raises(ValueError, match="expected one for all"):
+        learn.read_pairs([same, other])

@@ -181,6 +181,28 @@ def test_a_control_that_makes_no_sense_is_no_success(mu, x64):
     assert found.status == tj.Status.NOT_CONVERGED
 
 
+def test_impossible_controls_are_refused_outside_jit():
+    problem = blurred(11)
+    for mu in (0.0, -1.0, np.nan, np.inf, np.ones(2)):
+        with pytest.raises(ValueError, match="expected one finite number above 0"):
+            tj.soft_solve(problem, gnc_mu=mu)
+    for iterations in (-1, 1.5, True):
+        with pytest.raises(ValueError, match="expected a whole number"):
+            tj.soft_solve(problem, iterations=iterations)
+
+
+def test_a_wrong_match_may_be_as_far_away_as_it_likes():
+    """The middle about which poses vary took part in wrong matches: DEGENERATE, where ``solve`` is OK."""
+    drawn = tj.synthetic.random_problem(0, n=100, outlier_rate=0.5)
+    src = drawn.src.copy()
+    src[np.flatnonzero(~drawn.inliers)[0]] = 4000.0
+    problem = tj.make_problem(src, drawn.dst, noise_bound=drawn.noise_bound)
+    found = jax.jit(tj.soft_solve)(problem)
+    assert found.solution.status == tj.Status.OK
+    assert found.status == tj.Status.OK
+    assert tj.metrics.errors(jax.device_get(found.pose), drawn.truth).rotation_deg < 3
+
+
 @pytest.mark.slow
 def test_single_precision_follows_double():
     problem = blurred(11, scale=1.3)

@@ -157,3 +157,51 @@ def test_a_stack_and_a_solution_of_another_problem_are_refused():
     result, other = (tj.register(m.src, m.dst, noise_bound=0.05) for m in (matches, others))
     with pytest.raises(ValueError, match="one problem and its solution"):
         tj.covariance(result.problem, other.solution)
+
+
+@pytest.mark.parametrize("scale", [1.0, None])
+@pytest.mark.parametrize("offset", [100.0, 1000.0])
+def test_far_origins_keep_a_finite_information(scale, offset):
+    """A turn about a far origin is nearly a shift: float32 took that for errors that are exactly zero."""
+    drawn = tj.synthetic.random_problem(0, n=100, outlier_rate=0.5)
+    here = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, scale=scale)
+    far = tj.make_problem(drawn.src + offset, drawn.dst, noise_bound=drawn.noise_bound, scale=scale)
+    found = tj.covariance(far, jax.jit(tj.solve, static_argnums=1)(far, GREEDY), 0.01)
+    problem = tj.host_problem(drawn.src + offset, drawn.dst, noise_bound=drawn.noise_bound, scale=scale)
+    moved = tj.register(drawn.src + offset, drawn.dst, noise_bound=drawn.noise_bound, scale=scale)
+    exact = tj.covariance(problem, moved.solution, 0.01)
+    assert np.isfinite(found.information).all()
+    np.testing.assert_allclose(found.covariance[:3, :3], exact.covariance[:3, :3], rtol=2e-3, atol=1e-9)
+    np.testing.assert_allclose(np.diagonal(found.information), np.diagonal(exact.information), rtol=5e-3)
+    # The rotation's own part does not depend on where the origin is.
+    near = tj.covariance(
+        tj.host_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, scale=scale), here.solution, 0.01
+    )
+    np.testing.assert_allclose(exact.covariance[:3, :3], near.covariance[:3, :3], rtol=1e-6, atol=1e-12)
+
+
+def test_other_records_are_told_apart():
+    drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
+    result = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+    problem = tj.host_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+    with pytest.raises(ValueError, match="give its .solution"):
+        tj.covariance(problem, result)
+    with pytest.raises(ValueError, match="convention=... has its name"):
+        tj.covariance(problem, result.solution, "gtsam")
+    with pytest.raises(ValueError, match="give solution.selection"):
+        tj.refit(problem, result.solution)
+    with pytest.raises(ValueError, match="expected Settings"):
+        tj.solve(problem, "greedy")
+    with pytest.raises(ValueError, match="make one with make_problem"):
+        tj.solve(drawn.src)
+    with pytest.raises(ValueError, match="made with a known scale"):
+        tj.refit(replace(problem, scale=None), result.solution.selection)
+    with pytest.raises(ValueError, match="received one Problem"):
+        tj.stack_problems(problem)
+    with pytest.raises(ValueError, match="problem 1 of the list"):
+        tj.stack_problems([problem, replace(problem, dst=problem.dst[:5])])
+    with pytest.raises(ValueError, match="inside jit use make_problem"):
+        jax.jit(lambda x: tj.host_problem(x, x, noise_bound=1.0))(drawn.src)
+    pose = jax.tree.map(lambda x: np.stack([x, x]), result.pose)
+    with pytest.raises(ValueError, match="use jax.vmap for stacks"):
+        tj.pose_difference(pose, pose)
