@@ -158,6 +158,14 @@ def test_nothing_and_bad_input():
         tj.solve_batch([tj.stack_problems([good, good])])
     with pytest.raises(ValueError, match=r"expected \(b, n, 3\)"):
         tj.solve_batch(good)
+    for wrong in (
+        {"mask": np.full(30, np.nan)}, {"src": good.src * 1j}, {"noise_bound": None},
+        {"pairs": np.full((3, 2), 0.5)},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match="make problems with make_problem"):
+            tj.solve_batch([dataclasses.replace(good, **wrong)])
+    with pytest.raises(ValueError, match="expected a jax.sharding.Mesh"):
+        tj.solve_batch([good], mesh=jax.devices())
     with pytest.raises(ValueError, match="expected a list"):
         tj.solve_batch(p for p in [good])
     with pytest.raises(ValueError, match="chunk_size is 0"):

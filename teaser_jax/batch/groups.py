@@ -47,6 +47,14 @@ def _read(problem: Any, axes: int, name: str) -> Problem:
             "solve_batch was called inside jit, vmap or grad: use jax.vmap(teaser_jax.solve) there."
         )
 
+    for field in (*FLOATS, "mask", "pairs"):
+        value = getattr(problem, field)
+        if value is None and field in ("scale", "pairs"):
+            continue
+        dtype = getattr(value, "dtype", None) or np.asarray(value).dtype
+        kind = np.dtype(dtype).kind
+        if kind in "cOUS" or (kind == "b") != (field == "mask") or (field == "pairs" and kind not in "iu"):
+            raise ValueError(f"{name} has {field} of type {dtype}: make problems with make_problem.")
     as_array: Any = np.asarray  # of its many signatures none is that of a field
     given = {field: getattr(problem, field) for field in FLOATS}
     floats: dict[str, Any] = {k: None if x is None else as_array(x, np.float64) for k, x in given.items()}

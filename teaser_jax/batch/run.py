@@ -70,6 +70,8 @@ def solve_batch(
         isinstance(chunk_size, bool) or not isinstance(chunk_size, Integral) or chunk_size < 1
     ):
         raise ValueError(f"chunk_size is {chunk_size!r}: expected the number of problems to send at a time.")
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise ValueError(f"mesh is of type {type(mesh).__name__}: expected a jax.sharding.Mesh.")
     if isinstance(problems, Problem):
         stack = read_stack(problems)
         count = len(stack.src)
