@@ -117,6 +117,23 @@ def holds_at(word: str, value: float, share: float = 0.9) -> Callable[[Results],
     return test
 
 
+def best_at(word: str, value: float) -> Callable[[Results], Verdict]:
+    """A peer whose name holds a word is right more often than every other method at a value."""
+
+    def test(results: Results) -> Verdict:
+        named = [m for m in results.methods if word in m]
+        if not named or value not in results.values or not results.of(named[0], value):
+            return Verdict("not run")
+        rest = {m: results.success(m, value) for m in results.methods if m not in (named[0], LIMIT)}
+        second = max(rest, key=lambda m: np.nan_to_num(rest[m], nan=-1))
+        found = results.success(named[0], value)
+        return Verdict(
+            f"{named[0]}: {found:.0%}, then {second}: {rest[second]:.0%}", bool(found > rest[second])
+        )
+
+    return test
+
+
 def faster_than(method: str, milliseconds: float) -> Callable[[Results], Verdict]:
     """The median time in every cell lies below a limit."""
 
@@ -258,13 +275,13 @@ CLAIMS = (
     Claim("Fig. 6b", "TEASER++ is robust to 99 %", "extreme", robust_to(CASCADE, 0.99)),
     Claim("Fig. 6b", "the same, refined (not in the paper)", "extreme", robust_to(OURS, 0.99)),
     Claim("Fig. 6b", "RANSAC-10k performs poorly", "extreme", breaks_at("RANSAC-10k", 0.95)),
-    Claim("Fig. 6b", "FGR performs poorly", "extreme", breaks_at("FGR", 0.99)),
+    Claim("Fig. 6b", "FGR performs poorly", "extreme", breaks_at("FGR", 0.95)),
     Claim("Fig. 6b", "RANSAC of a minute resists 98 %", "extreme", holds_at("RANSAC-60s", 0.98)),
     Claim("Fig. 6c", "TEASER++ is robust to 80 %, fails at 90 %", "unknown-scale", robust_to(CASCADE, 0.8)),
     Claim("Fig. 6c", "under 30 ms", "unknown-scale", faster_than(f"{OURS}, one by one", 30)),
     Claim("Fig. 6c", "FGR with Horn's scale fails at 70 %", "unknown-scale", breaks_at("FGR", 0.7)),
     Claim("Fig. 6c", "RANSAC-1k fails at 90 %", "unknown-scale", breaks_at("RANSAC-1k", 0.9)),
-    Claim("Fig. 6c", "RANSAC of a minute is the best at 90 %", "unknown-scale", holds_at("RANSAC-60s", 0.9)),
+    Claim("Fig. 6c", "RANSAC of a minute is the best at 90 %", "unknown-scale", best_at("RANSAC-60s", 0.9)),
     Claim("Fig. 7a, b", "TEASER++ is right down to an overlap of 10 %", "all-to-all", robust_to(OURS, 0.1)),
     Claim("Fig. 7a, b", "ICP fails practically always", "all-to-all", _icp),
     Claim("Fig. 7c", "the clique and the scale dominate the time", "all-to-all", _stages),

@@ -63,6 +63,8 @@ def _report(found: dict[str, Results], folder: Path, here: Path) -> Iterator[str
 def _claims(found: dict[str, Results]) -> Iterator[str]:
     yield "## Every figure and table"
     yield ""
+    yield "A **no** beside another library means that it does better here than in the paper."
+    yield ""
     yield "| paper | what it reports | here | reproduced |"
     yield "|---|---|---|---|"
     for claim in CLAIMS:
