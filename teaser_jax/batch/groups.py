@@ -15,6 +15,7 @@ from teaser_jax.register import bucket, float32_will_do, median
 from teaser_jax.types import Problem, Settings
 
 FLOATS = ("src", "dst", "noise_bound", "cbar2", "confidence", "scale")
+DOUBLE, USUAL = np.dtype(np.float64), {"mask": np.dtype(bool), "pairs": np.dtype(np.int32)}
 
 Origins = tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3"]]
 
@@ -49,11 +50,12 @@ def _read(problem: Any, axes: int, name: str) -> Problem:
 
     for field in (*FLOATS, "mask", "pairs"):
         value = getattr(problem, field)
-        if value is None and field in ("scale", "pairs"):
+        dtype = getattr(value, "dtype", None)
+        if dtype is USUAL.get(field, DOUBLE) or (value is None and field in ("scale", "pairs")):
             continue
-        dtype = getattr(value, "dtype", None) or np.asarray(value).dtype
-        kind = np.dtype(dtype).kind
-        if kind in "cOUS" or (kind == "b") != (field == "mask") or (field == "pairs" and kind not in "iu"):
+        dtype = np.asarray(value).dtype if dtype is None else np.dtype(dtype)
+        allowed = {"mask": "b", "pairs": "iu"}.get(field, "fiuV")  # V: numpy's name for bfloat16
+        if dtype.kind not in allowed:
             raise ValueError(f"{name} has {field} of type {dtype}: make problems with make_problem.")
     as_array: Any = np.asarray  # of its many signatures none is that of a field
     given = {field: getattr(problem, field) for field in FLOATS}
