@@ -46,11 +46,20 @@ def training_scans(count: int) -> list[synthetic.ScanPair]:
 
 
 def test_scans(count: int) -> dict[str, list[synthetic.ScanPair]]:
-    """Pairs by the kind of shape, none of which is trained on."""
-    shapes = {name: models.family(k + 1, kinds, 10) for k, (name, kinds) in enumerate(FAMILIES.items())}
+    """Pairs by the kind of shape, none of which is trained on: four times as many of unseen families.
+
+    A family has many shapes, and some are harder than others: with ten of them the figure is theirs.
+    """
+    many = 4 * count
+    shapes = {
+        name: models.family(k + 1, kinds, many // 4) for k, (name, kinds) in enumerate(FAMILIES.items())
+    }
     shapes["teapot"] = [models.unit(synthetic.teapot(models.DENSE))]
     shapes |= models.real_models()
-    return {name: scans(20 + k, known, count) for k, (name, known) in enumerate(shapes.items())}
+    return {
+        name: scans(20 + k, known, many if name in FAMILIES else count)
+        for k, (name, known) in enumerate(shapes.items())
+    }
 
 
 def untrusted_labels(parameters: Any, pairs: learn.Pairs, noise_bound: float) -> learn.Labels:
