@@ -255,6 +255,22 @@ def test_every_study_draws_what_it_says():
         assert len({m.name for m in study.methods}) == len(study.methods)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(studies()))
+def test_every_study_runs(name, tmp_path):
+    """In the range of errors that the paper's figures show: its easiest cell is solved by every method."""
+    study = studies()[name]
+    chosen = [method for method in study.methods if not method.slow and not method.others]
+    run_study(name, tmp_path, quick=True, runs=1, methods=[method.name for method in chosen])
+    results = read_results(tmp_path / name)
+    assert len(results.rows) == len(study.quick_values) * len(chosen)
+    assert not [row for row in results.rows if "error" in row]
+    assert all(results.success(method, results.values[0]) == 1 for method in results.methods)
+    assert {column for row in results.rows for column in row} - {study.sweep, "trial", "method"} <= {
+        *study.columns
+    }
+
+
 def test_problems_come_back_from_shards_bit_for_bit(tmp_path):
     drawn = [
         *draw_trials(studies()["unknown-scale"], runs=3, quick=True),

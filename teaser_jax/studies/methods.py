@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
@@ -25,12 +24,13 @@ from teaser_jax.stages.translation import estimate_translation
 from teaser_jax.studies.peers import Peer
 from teaser_jax.studies.trials import Trial
 from teaser_jax.types import CliqueMethod, Criterion, Pose, RotationMethod, Settings, Solution, Status
-from teaser_jax.wahba import solve_rotation
+from teaser_jax.wahba import RotationSolution, solve_rotation
 
 Row: TypeAlias = dict[str, Any]
 OURS = "teaser_jax"
 LIMIT = "least squares on the true inliers"
 SDP_MOST = 21  # right matches whose chain the semidefinite relaxation takes in some seconds
+VOTES: dict[Criterion, str] = {"tls": "TLS", "consensus": "consensus maximisation"}
 STAGES = {
     "scale": "stage_scale", "consistency graph": "stage_graph", "clique, device": "stage_clique",
     "clique, host": "stage_clique", "rotation": "stage_rotation", "translation": "stage_translation",
@@ -67,7 +67,7 @@ def in_batches(name: str = OURS, **chosen: Any) -> Method:
 
 def one_by_one(name: str, *, suits: Callable[[Trial], bool] | None = None, **chosen: Any) -> Method:
     """``register`` on each trial, warm."""
-    settings, warm = Settings(**chosen), _Once()
+    settings = Settings(**chosen)
 
     def solve(trial: Trial) -> Solution:
         p = trial.problem
@@ -75,17 +75,9 @@ def one_by_one(name: str, *, suits: Callable[[Trial], bool] | None = None, **cho
             p.src, p.dst, noise_bound=p.noise_bound, scale=trial.scale, settings=settings
         ).solution
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
-        for trial in trials:
-            if settings.rotation != "sdp":
-                warm(len(trial.problem.src), partial(solve, trial))
-            with _timed() as clock:
-                found = solve(trial)
-            rows.append(_judged(trial, found) | clock)
-        return rows
-
-    return Method(name, run, suits=suits or (lambda trial: True), slow=settings.rotation == "sdp")
+    slow = settings.rotation == "sdp"
+    run = _each(solve, _judged, compiles=not slow)
+    return Method(name, run, suits=suits or (lambda trial: True), slow=slow)
 
 
 def few_right(trial: Trial) -> bool:
@@ -129,58 +121,40 @@ def limit() -> Method:
 def of_peer(name: str, peer: Peer) -> Method:
     """Another library; asked only what it can answer."""
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
-        for trial in trials:
-            p = trial.problem
-            with _timed() as clock:
-                pose = peer.solve(p.src, p.dst, p.noise_bound, trial.scale)
-            rows.append(errors(trial, pose) | clock)
-        return rows
+    def solve(trial: Trial) -> Pose:
+        p = trial.problem
+        return peer.solve(p.src, p.dst, p.noise_bound, trial.scale)
 
     suits = lambda trial: peer.finds_scale or trial.scale is not None
+    run = _each(solve, errors, compiles=False)
     return Method(name, run, suits=suits, slow=name.endswith("RANSAC-60s"), others=True)
 
 
 def scale_by_vote(criterion: Criterion) -> Method:
     """The scale of all pairs of matches, by the adaptive vote (section VI-A)."""
-    warm = _Once()
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
+    def solve(trial: Trial) -> float:
+        p = trial.for_solver()
         with jax.enable_x64(True):
-            for trial in trials:
-                p = trial.for_solver()
-                inputs = (p.src, p.dst, p.noise_bound, p.mask)
-                vote = lambda x=inputs: float(_scale(*x, cbar2=1.0, criterion=criterion)[0])
-                warm(len(p.src), vote)
-                with _timed() as clock:
-                    scale = vote()
-                rows.append({"scale_error": abs(scale - float(trial.problem.truth.scale))} | clock)
-        return rows
+            return float(_scale(p.src, p.dst, p.noise_bound, p.mask, cbar2=1.0, criterion=criterion)[0])
 
-    return Method({"tls": "TLS", "consensus": "consensus maximisation"}[criterion], run)
+    judge = lambda trial, scale: {"scale_error": abs(scale - float(trial.problem.truth.scale))}
+    return Method(VOTES[criterion], _each(solve, judge))
 
 
 def translation_by_vote(criterion: Criterion) -> Method:
     """The translation, axis by axis (section VI-C), where the rotation is the identity."""
-    warm = _Once()
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
+    def solve(trial: Trial) -> np.ndarray:
+        p = trial.for_solver()
         with jax.enable_x64(True):
-            for trial in trials:
-                p = trial.for_solver()
-                inputs = (p.dst - p.src, p.noise_bound, p.mask)
-                vote = lambda x=inputs: np.asarray(_translation(*x, cbar2=1.0, criterion=criterion)[0])
-                warm(len(p.src), vote)
-                with _timed() as clock:
-                    found = vote()
-                error = float(np.linalg.norm(found - trial.problem.truth.translation))
-                rows.append({"translation": error} | clock)
-        return rows
+            found, _ = _translation(p.dst - p.src, p.noise_bound, p.mask, cbar2=1.0, criterion=criterion)
+            return np.asarray(found)
 
-    return Method({"tls": "TLS", "consensus": "consensus maximisation"}[criterion], run)
+    def judge(trial: Trial, found: np.ndarray) -> Row:
+        return {"translation": float(np.linalg.norm(found - trial.problem.truth.translation))}
+
+    return Method(VOTES[criterion], _each(solve, judge))
 
 
 def clique_alone(name: str, clique: CliqueMethod) -> Method:
@@ -197,50 +171,44 @@ def before_pruning() -> Method:
 
 def rotation_alone(name: str, method: RotationMethod) -> Method:
     """Rotation search on vectors, without a proof (section VII)."""
-    warm = _Once()
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
-        for trial in trials:
-            p = trial.problem
-            solve = lambda p=p: solve_rotation(
-                p.src, p.dst, noise_bound=p.noise_bound, method=method, proof=None
-            )
-            if method != "sdp":
-                warm(len(p.src), solve)
-            with _timed() as clock:
-                found = solve()
-            rows.append(errors(trial, _turn(found.rotation)) | {"cost": float(found.cost)} | clock)
-        return rows
+    def solve(trial: Trial) -> RotationSolution:
+        p = trial.problem
+        return solve_rotation(p.src, p.dst, noise_bound=p.noise_bound, method=method, proof=None)
 
-    return Method(name, run, slow=method == "sdp")
+    judge = lambda trial, found: errors(trial, _turn(found.rotation)) | {"cost": float(found.cost)}
+    slow = method == "sdp"
+    return Method(name, _each(solve, judge, compiles=not slow), slow=slow)
 
 
 def rotation_certified(name: str, proof: CertifyMethod) -> Method:
-    """GNC's rotation and its certificate (section VIII): proved within 0.1 % and 200 iterations, or not."""
-    warm = _Once()
+    """GNC's rotation and its certificate (section VIII): proved within 0.1 % and 200 iterations, or not.
+
+    The time is that of the certificate.
+    """
+    once = _Once()
 
     def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
         rows = []
         for trial in trials:
             p = trial.problem
             found = solve_rotation(p.src, p.dst, noise_bound=p.noise_bound, method="gnc", proof=None)
-            certify = lambda p=p, r=found.rotation: certify_rotation(
-                p.src, p.dst, r, noise_bound=p.noise_bound, iterations=200, method=proof
-            )
-            warm(len(p.src), certify)
-            with _timed() as clock:
-                certificate = certify()
-            rows.append(
-                errors(trial, _turn(found.rotation))
-                | {
-                    "proved": int(certificate.is_optimal),
-                    "suboptimality": float(certificate.suboptimality),
-                    "iterations": int(certificate.iterations),
-                    "cost": float(found.cost),
-                }
-                | clock
-            )
+            certify = partial(
+                certify_rotation, p.src, p.dst, found.rotation,
+                noise_bound=p.noise_bound, iterations=200, method=proof,
+            )  # fmt: skip
+            once(len(p.src), certify)
+            start = time.perf_counter()
+            certificate = certify()
+            seconds = time.perf_counter() - start
+            rows.append({
+                **errors(trial, _turn(found.rotation)),
+                "proved": int(certificate.is_optimal),
+                "suboptimality": float(certificate.suboptimality),
+                "iterations": int(certificate.iterations),
+                "cost": float(found.cost),
+                "seconds": seconds,
+            })  # fmt: skip
         return rows
 
     return Method(name, run, slow=proof == "reference")
@@ -285,6 +253,29 @@ def _turn(rotation: Any) -> Pose:
     return Pose(np.asarray(rotation), np.zeros(3), np.asarray(1.0))
 
 
+def _each(
+    solve: Callable[[Trial], Any],
+    judge: Callable[[Trial, Any], Row],
+    *,
+    compiles: bool = True,
+) -> Callable[[list[Trial], Mesh | None], list[Row]]:
+    """Trials one by one: the seconds of ``solve``, warm, and what ``judge`` makes of its answer."""
+    once = _Once()
+
+    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
+        rows = []
+        for trial in trials:
+            if compiles:
+                once(len(trial.problem.src), partial(solve, trial))
+            start = time.perf_counter()
+            found = solve(trial)
+            seconds = time.perf_counter() - start
+            rows.append(judge(trial, found) | {"seconds": seconds})
+        return rows
+
+    return run
+
+
 class _Once:
     """Runs something the first time a size comes, so that what is timed does not compile."""
 
@@ -295,14 +286,6 @@ class _Once:
         if size not in self.seen:
             run()
             self.seen.add(size)
-
-
-@contextmanager
-def _timed() -> Iterator[Row]:
-    row: Row = {}
-    start = time.perf_counter()
-    yield row
-    row["seconds"] = time.perf_counter() - start
 
 
 _scale = jax.jit(estimate_scale, static_argnames="criterion")
