@@ -23,7 +23,7 @@ from teaser_jax import Settings, learn, register, synthetic
 from teaser_jax import metrics as pose_metrics
 
 SEEDS = 3
-STEPS = 500
+STEPS = 620
 NOISE_BOUND = 0.05
 TURN = (20.0, 50.0)  # between the two views [deg]
 LARGEST_ANGLE, LARGEST_DISTANCE = 5.0, 0.05  # of an answer that is right [deg], [1]
@@ -179,7 +179,7 @@ def _classical(pairs: list, radii: tuple[float, float], mutual: bool) -> tuple[n
 def run(quick: bool) -> list[dict]:
     """A row for each arm, seed and test set, and one for each training."""
     seeds, steps, count = (1, 60, 6) if quick else (SEEDS, STEPS, 30)
-    train, tests = training_scans(30 if quick else 300), test_scans(count)
+    train, tests = training_scans(30 if quick else 450), test_scans(count)
     rows = list(classical(train, tests))
     pairs = learn.read_pairs(train)
     read = {name: learn.read_pairs(each) for name, each in tests.items()}
