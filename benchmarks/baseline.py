@@ -44,23 +44,17 @@ def machine() -> dict[str, str]:
     import jax
 
     import teaser_jax
+    from teaser_jax.studies.run import processor
 
     return {
         "device": f"{jax.devices()[0]} ({jax.devices()[0].device_kind})",
-        "processor": _processor(),
+        "processor": processor(),
         "cores": str(len(os.sched_getaffinity(0))),
         "python": platform.python_version(),
         "teaser_jax": teaser_jax.__version__,
         **{name: version(name) for name in ("jax", "numpy", "numba")},
         "date": time.strftime("%Y-%m-%d"),
     }
-
-
-def _processor() -> str:
-    listed = Path("/proc/cpuinfo")
-    lines = listed.read_text().splitlines() if listed.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
 
 
 def update(name: str, metrics: list[Metric], where: dict[str, str]) -> None:

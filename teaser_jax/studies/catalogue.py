@@ -95,12 +95,11 @@ def studies() -> dict[str, Study]:
     """All studies by name, with the peers that this environment has."""
     peers, _ = find_peers()
     others = {name: m.of_peer(name, peer) for name, peer in peers.items()}
-    matched = tuple(others[name] for name in others if "RANSAC-10k" not in name and "ICP" not in name)
-    extreme = tuple(others[name] for name in others if "RANSAC-1k" not in name and "ICP" not in name)
-    unmatched = tuple(others[name] for name in others if "RANSAC" not in name)
-    scaled = tuple(others[name] for name, peer in peers.items() if peer.finds_scale and "10k" not in name)
-    growing = tuple(others[name] for name in others if "RANSAC" not in name and "ICP" not in name)
-    icp = tuple(others[name] for name in others if "ICP" in name)
+
+    def without(*words: str) -> tuple[Method, ...]:
+        return tuple(each for name, each in others.items() if not any(word in name for word in words))
+
+    scaled = tuple(each for each in without("RANSAC-10k") if peers[each.name].finds_scale)
     solvers = (
         m.limit(),
         m.in_batches(),
@@ -112,7 +111,7 @@ def studies() -> dict[str, Study]:
     pose_is_right = below(rotation_deg=5.0)
     known = Study(
         "known-scale", "Fig. 6a", "known scale, N = 100", OUTLIERS, TENTHS, (0.0, 0.5, 0.9),
-        partial(_matched, n=100), (*solvers, *matched, *icp), POSE, POSE_COLUMNS, pose_is_right,
+        partial(_matched, n=100), (*solvers, *without("RANSAC-10k")), POSE, POSE_COLUMNS, pose_is_right,
     )  # fmt: skip
     found = [
         Study(
@@ -166,7 +165,7 @@ def studies() -> dict[str, Study]:
         known,
         Study(
             "extreme", "Fig. 6b", "known scale, N = 1000", OUTLIERS, (0.95, 0.96, 0.97, 0.98, 0.99),
-            (0.95, 0.99), partial(_matched, n=1000), (*solvers, *extreme), POSE,
+            (0.95, 0.99), partial(_matched, n=1000), (*solvers, *without("RANSAC-1k", "ICP")), POSE,
             POSE_COLUMNS, pose_is_right,
         ),
         Study(
@@ -183,7 +182,7 @@ def studies() -> dict[str, Study]:
         Study(
             "all-to-all", "Fig. 7", "no correspondences, 100 points against a part of them, bound 0.01",
             OVERLAP, tuple(k / 10 for k in range(10, 0, -1)), (1.0, 0.4, 0.1), _all_to_all,
-            (m.limit(), m.in_batches(), m.stage_by_stage(), *unmatched), POSE,
+            (m.limit(), m.in_batches(), m.stage_by_stage(), *without("RANSAC")), POSE,
             (*POSE_COLUMNS, *STAGES), pose_is_right,
         ),
         replace(
@@ -193,7 +192,10 @@ def studies() -> dict[str, Study]:
         Study(
             "scaling", "supplement", "known scale, 95 % wrong", MATCHES,
             (100, 200, 500, 1000, 2000, 5000, 10_000), (100, 500, 2000), _growing,
-            (m.limit(), m.in_batches(), m.one_by_one(f"{m.OURS}, one by one"), m.stage_by_stage(), *growing),
+            (
+                m.limit(), m.in_batches(), m.one_by_one(f"{m.OURS}, one by one"), m.stage_by_stage(),
+                *without("RANSAC", "ICP"),
+            ),
             POSE, (*POSE_COLUMNS, *STAGES), pose_is_right,
         ),
     ]  # fmt: skip

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from teaser_jax.studies.catalogue import OVERLAP
 from teaser_jax.studies.methods import LIMIT, OURS
 from teaser_jax.studies.results import Results
 
+NEARLY_ALL = 0.95  # of the runs
 CASCADE = f"{OURS}, cascade"
 TLS, CONSENSUS = "TLS", "consensus maximisation"
 NOT_INSTALLABLE = "no package index has it, and its licence or toolchain keeps it from being built here"
@@ -62,74 +64,63 @@ def median(results: Results, method: str, value: float, column: str) -> float:
     return float(np.median(numbers)) if len(numbers) else float("nan")
 
 
-def robust_to(
-    method: str,
-    last: float,
-    *,
-    share: float = 0.95,
-) -> Callable[[Results], Verdict]:
+def robust_to(method: str, last: float) -> Callable[[Results], Verdict]:
     """Right in nearly all runs up to a value (down to it, where overlap is swept)."""
 
     def test(results: Results) -> Verdict:
-        overlap = results.study.sweep == "overlap"
-        cells = [v for v in results.values if (v >= last - 1e-9 if overlap else v <= last + 1e-9)]
-        if not cells or method not in results.methods or last not in results.values:
+        down = results.study.sweep == OVERLAP
+        cells = [v for v in results.values if (v >= last if down else v <= last)]
+        if method not in results.methods or last not in results.values:
             return Verdict("not run")
-        worst = min(cells, key=lambda v: results.success(method, v))
+        worst = min(results.success(method, v) for v in cells)
         rest = [v for v in results.values if v not in cells]
-        found = f"{method}: at least {results.success(method, worst):.0%} right up to there"
-        if overlap:
-            found = f"{method}: at least {results.success(method, worst):.0%} right down to there"
+        found = f"{method}: at least {worst:.0%} right {'down' if down else 'up'} to there"
         if rest:
             found += "; beyond: " + _listed(results, method, rest)
-        return Verdict(found, results.success(method, worst) >= share)
+        return Verdict(found, worst >= NEARLY_ALL)
 
     return test
 
 
 def breaks_at(word: str, value: float) -> Callable[[Results], Verdict]:
-    """A peer whose name holds a word: right below a value, not there."""
+    """A method whose name holds a word: right below a value, not there."""
 
-    def test(results: Results) -> Verdict:
-        named = [m for m in results.methods if word in m]
-        if not named or value not in results.values:
-            return Verdict("not run")
+    def say(results: Results, name: str) -> Verdict:
         near = [v for v in results.values if abs(v - value) < 0.25]
-        found = f"{named[0]}: {_listed(results, named[0], near)}"
-        return Verdict(found, results.success(named[0], value) < 0.95)
+        found = f"{name}: {_listed(results, name, near)}"
+        return Verdict(found, results.success(name, value) < NEARLY_ALL)
 
-    return test
+    return _of_one(word, value, say)
 
 
-def holds_at(word: str, value: float, share: float = 0.9) -> Callable[[Results], Verdict]:
-    """A peer whose name holds a word is right at a value."""
+def holds_at(word: str, value: float) -> Callable[[Results], Verdict]:
+    """A method whose name holds a word is right in nine of ten runs at a value."""
 
-    def test(results: Results) -> Verdict:
-        named = [m for m in results.methods if word in m]
-        if not named or value not in results.values:
-            return Verdict("not run")
-        found = results.success(named[0], value)
-        if np.isnan(found):
-            return Verdict("not run")
-        runs = len(results.of(named[0], value))
-        return Verdict(f"{named[0]}: {found:.0%} of {runs} right at {value:.0%}", found >= share)
+    def say(results: Results, name: str) -> Verdict:
+        share, runs = results.success(name, value), len(results.of(name, value))
+        return Verdict(f"{name}: {share:.0%} of {runs} right at {value:.0%}", share >= 0.9)
 
-    return test
+    return _of_one(word, value, say)
 
 
 def best_at(word: str, value: float) -> Callable[[Results], Verdict]:
-    """A peer whose name holds a word is right more often than every other method at a value."""
+    """A method whose name holds a word is right more often than every other at a value."""
+
+    def say(results: Results, name: str) -> Verdict:
+        rest = {m: results.success(m, value) for m in results.methods if m not in (name, LIMIT)}
+        second = max(rest, key=lambda m: np.nan_to_num(rest[m], nan=-1))
+        share = results.success(name, value)
+        return Verdict(f"{name}: {share:.0%}, then {second}: {rest[second]:.0%}", share > rest[second])
+
+    return _of_one(word, value, say)
+
+
+def _of_one(word: str, value: float, say: Callable[[Results, str], Verdict]) -> Callable[[Results], Verdict]:
+    """What is said of the first method whose name holds a word, where it was run at a value."""
 
     def test(results: Results) -> Verdict:
         named = [m for m in results.methods if word in m]
-        if not named or value not in results.values or not results.of(named[0], value):
-            return Verdict("not run")
-        rest = {m: results.success(m, value) for m in results.methods if m not in (named[0], LIMIT)}
-        second = max(rest, key=lambda m: np.nan_to_num(rest[m], nan=-1))
-        found = results.success(named[0], value)
-        return Verdict(
-            f"{named[0]}: {found:.0%}, then {second}: {rest[second]:.0%}", bool(found > rest[second])
-        )
+        return say(results, named[0]) if named and results.of(named[0], value) else Verdict("not run")
 
     return test
 

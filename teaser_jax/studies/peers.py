@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from functools import partial
@@ -141,6 +142,7 @@ def _pose(rotation: Any, translation: Any, scale: Any = 1.0) -> Pose:
 MAKERS = {"teaserpp_python": _teaserpp, "kiss-matcher": _kiss_matcher, "open3d": _open3d}
 
 
+@functools.cache
 def find_peers() -> tuple[dict[str, Peer], dict[str, str]]:
     """The peers of this environment by name, and why each missing package is missing."""
     peers: dict[str, Peer] = {}

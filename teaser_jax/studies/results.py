@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from teaser_jax.files import FileError
 from teaser_jax.studies.catalogue import Study, studies
 from teaser_jax.studies.methods import Row
-from teaser_jax.studies.table import read_table
+from teaser_jax.studies.table import read_table, written
 
 TABLE, ABOUT, PICTURE, PAGE = "table.csv", "about.json", "figure.png", "figure.html"
 
@@ -28,29 +29,34 @@ class Results:
     @property
     def title(self) -> str:
         """Of the figure: what, with which model, how many runs."""
-        study, runs = (
-            self.study,
-            sorted({len(self.of(m, v)) for m in self.methods for v in self.values} - {0}),
-        )
+        runs = sorted({len(rows) for rows in self._cells.values()})
         spread = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}" if runs else "0"
-        return f"{study.title}; model: {self.about['model']}; {spread} runs a box ({study.figure})"
+        return f"{self.study.title}; model: {self.about['model']}; {spread} runs a box ({self.study.figure})"
+
+    @cached_property
+    def _cells(self) -> dict[tuple[str, str], list[Row]]:
+        """The rows of each method and cell."""
+        found: dict[tuple[str, str], list[Row]] = {}
+        for row in self.rows:
+            found.setdefault((row["method"], written(row[self.study.sweep])), []).append(row)
+        return found
 
     @property
     def values(self) -> list[float]:
         """The cells, in the study's order."""
-        return [v for v in self.study.values if any(np.isclose(r[self.study.sweep], v) for r in self.rows)]
+        there = {value for _, value in self._cells}
+        return [v for v in self.study.values if written(v) in there]
 
     @property
     def methods(self) -> list[str]:
         """Those of the table, in the study's order; then those whose package is missing here."""
-        there = list(dict.fromkeys(row["method"] for row in self.rows))
+        there = dict.fromkeys(method for method, _ in self._cells)
         order = [method.name for method in self.study.methods]
         return sorted(there, key=lambda name: order.index(name) if name in order else len(order))
 
     def of(self, method: str, value: float) -> list[Row]:
         """The rows of one method and cell."""
-        sweep = self.study.sweep
-        return [row for row in self.rows if row["method"] == method and np.isclose(row[sweep], value)]
+        return self._cells.get((method, written(value)), [])
 
     def measured(self, method: str, value: float, column: str) -> np.ndarray:
         """The numbers of a column in one cell; runs that raised have none."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -21,7 +22,7 @@ from teaser_jax.studies.catalogue import Study, studies
 from teaser_jax.studies.figures import check_drawing, draw_study
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.results import ABOUT, TABLE
-from teaser_jax.studies.table import Table
+from teaser_jax.studies.table import Table, written
 from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, whole_number
 
 PACKAGES = ("teaser-jax", "jax", "jaxlib", "numpy", "numba", "scs", "kiss-matcher", "open3d-cpu", "open3d")
@@ -152,18 +153,13 @@ def _todo(
     for value, numbers in cells:
         trial = first(value)
         for method in chosen:
-            missing = [k for k in numbers if (_short(value), k, method.name) not in known]
+            missing = [k for k in numbers if (written(value), k, method.name) not in known]
             if missing and method.suits(trial):
                 yield Todo(value, method, missing)
 
 
 def _key(row: Row, study: Study) -> tuple[Any, ...]:
-    return _short(row[study.sweep]), int(row["trial"]), row["method"]
-
-
-def _short(value: float) -> str:
-    """A value as tables write it, so that what is read equals what is asked."""
-    return f"{value:.7g}"
+    return written(row[study.sweep]), int(row["trial"]), row["method"]
 
 
 def _opened(place: Path, study: Study, seed: int, model: Model) -> Table:
@@ -204,7 +200,7 @@ def environment() -> dict[str, Any]:
             continue
     device = jax.devices()[0]
     return {
-        "processor": _processor(),
+        "processor": f"{processor()}, {os.cpu_count()} cores",
         "devices": f"{jax.device_count()} x {device.device_kind} ({device.platform})",
         "processes": jax.process_count(),
         "python": platform.python_version(),
@@ -212,11 +208,12 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _processor() -> str:
+def processor() -> str:
+    """The name of the processor, as the system knows it."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{named[0]}, {len(named)} cores" if named else platform.processor() or platform.machine()
+    return named[0] if named else platform.processor() or platform.machine()
 
 
 def named_study(name: str) -> Study:

@@ -106,7 +106,12 @@ def _text(value: Any) -> str:
         return ""
     if isinstance(value, str):
         return " ".join(value.split())  # a row is a line
-    return f"{float(value):.7g}"
+    return written(float(value))
+
+
+def written(number: float) -> str:
+    """A number as tables hold it, so that what is read can be compared with what was meant."""
+    return f"{number:.7g}"
 
 
 def _lock(file: BinaryIO, path: Path) -> None:
