@@ -25,9 +25,9 @@ class PackedProblem(NamedTuple):
     pairs: Int[AnyArray, "m 2"] | None
 
     @property
-    def mask(self) -> Bool[AnyArray, " n"]:
+    def mask(self) -> Bool[AnyArray, "*b n"]:
         """Rows to use."""
-        return self.columns[8] > 0
+        return self.columns[..., 8, :] > 0
 
 
 def pack_problem(problem: Problem, settings: Settings, n: int, m: int | None) -> PackedProblem:

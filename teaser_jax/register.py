@@ -315,10 +315,12 @@ def between(
     )  # fmt: skip
 
 
-def since_clique(sent: PackedProblem, graph: Graph, clique: Clique, choices: Settings) -> PackedSolution:
+def since_clique(
+    sent: PackedProblem, graph: Graph, clique: Clique, choices: Settings, room: int | None = None
+) -> PackedSolution:
     """Device program two: the sets, the pose, the verdict."""
     problem, settings = unpack_problem(sent, choices)
-    return pack_solution(conclude(problem, graph, clique, settings))
+    return pack_solution(conclude(problem, graph, clique, settings, room=room))
 
 
 before_clique = jax.jit(until_clique, static_argnames="dtype", compiler_options=WHOLE_SUMS | WIDE_VECTORS)

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
+from teaser_jax.stages import bits
 from teaser_jax.stages.clique import Clique, maximum_clique
 from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.invariants import tim_bounds, tims
@@ -148,10 +149,20 @@ def find_clique(problem: Problem, graph: Graph, settings: Settings = Settings())
     )
 
 
-def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()) -> Solution:
-    """Everything behind the clique: the sets, the pose, and whether to trust it."""
+def conclude(
+    problem: Problem,
+    graph: Graph,
+    clique: Clique,
+    settings: Settings = Settings(),
+    *,
+    room: int | None = None,
+) -> Solution:
+    """Everything behind the clique: the sets, the pose, and whether to trust it.
+
+    ``room`` as in ``choose``.
+    """
     graph, clique = lax.stop_gradient((graph, clique))
-    selection, converged = choose(lax.stop_gradient(problem), graph, clique, settings)
+    selection, converged = choose(lax.stop_gradient(problem), graph, clique, settings, room=room)
     pose = _refit(problem, selection, refined=settings.refine)
     p, excluded = usable_rows(problem)
     frozen_pose = lax.stop_gradient(pose)
@@ -174,27 +185,64 @@ def conclude(problem: Problem, graph: Graph, clique: Clique, settings: Settings 
 
 
 def choose(
-    problem: Problem, graph: Graph, clique: Clique, settings: Settings = Settings()
+    problem: Problem,
+    graph: Graph,
+    clique: Clique,
+    settings: Settings = Settings(),
+    *,
+    room: int | None = None,
 ) -> tuple[Selection, Bool[Array, ""]]:
     """Which measurements to trust, given the clique, and whether every iteration settled.
+
+    Args:
+        problem, graph, clique: What the stages before have found.
+        settings: How to go on.
+        room: At least the size of the clique, if that is known when the program is compiled: rotation and
+            translation are then found in so many rows instead of all. Without given pairs, and with TIMs
+            in a chain.
 
     Gradients: none; the caller stops the inputs.
     """
     members = clique.members & usable_rows(problem)[0].mask
-    turned = find_rotation(problem, graph.scale, members, settings)
-    cascade, axes = find_translation(problem, graph.scale, members, turned.rotation, settings)
+    rows = None if room is None else bits.listed(members)[:room]
+    few, present = (problem, members) if rows is None else _rows_of(problem, members, rows)
+    turned = find_rotation(few, graph.scale, present, settings)
+    cascade, axes = find_translation(few, graph.scale, present, turned.rotation, settings)
+    tims_kept = turned.members
+    if rows is not None:
+        place = jnp.where(present, rows, members.shape[0])
+        tims_kept, axes = (
+            jnp.zeros((members.shape[0], *x.shape[1:]), bool).at[place].set(x, mode="drop")
+            for x in (tims_kept, axes)
+        )
     inliers, settled = members & jnp.all(axes, axis=1), jnp.ones((), bool)
     if settings.refine:
         inliers, settled = find_inliers(problem, cascade, settings)
     selection = Selection(
         scale_pairs=graph.scale_pairs,
         clique=members,
-        rotation=turned.members,
+        rotation=tims_kept,
         translation=axes,
         inliers=inliers,
         refined=jnp.asarray(settings.refine),
     )
     return selection, turned.converged & settled
+
+
+def _rows_of(
+    problem: Problem, members: Bool[Array, " n"], rows: Int[Array, " k"]
+) -> tuple[Problem, Bool[Array, " k"]]:
+    """The problem of the clique's members alone, in the user's order, and which of its rows are one."""
+    present = jnp.arange(rows.shape[0], dtype=jnp.int32) < jnp.sum(members, dtype=jnp.int32)
+    few = replace(
+        problem,
+        src=problem.src[rows],
+        dst=problem.dst[rows],
+        noise_bound=problem.noise_bound[rows],
+        mask=present,
+        confidence=problem.confidence[rows],
+    )
+    return few, present
 
 
 def find_rotation(

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import teaser_jax as tj
-from teaser_jax.batch.programs import MOST
+from teaser_jax.batch.groups import Size
+from teaser_jax.batch.programs import MOST, NO_ROOM, rooms
 from teaser_jax.synthetic import random_problem
 
 HERE = Path(__file__).parent
@@ -84,6 +85,39 @@ def test_order_neighbours_and_chunks_do_not_matter(many, answers):
     for place, found in zip(order, tj.solve_batch([many[k] for k in order], chunk_size=1), strict=True):
         assert_same(found, answers[place])
     assert_same(tj.solve_batch(many[7:8])[0], answers[7])
+
+
+def test_large_problems_are_solved_in_turn_and_by_the_size_of_their_cliques():
+    """Cliques of 13 to 256 members: rooms of 32, 64, 256, and none."""
+    rates = (0.975, 0.9, 0.8, 0.5, 0.3)
+    problems = [problem(k, n=512, rate=rates[k % 5]) for k in range(10)]
+    expected = tj.solve_batch(problems)
+    assert all(found.ok for found in expected)
+    order = np.random.default_rng(1).permutation(10)
+    for place, found in zip(order, tj.solve_batch([problems[k] for k in order], chunk_size=1), strict=True):
+        assert_same(found, expected[place])
+    for one, found in zip(problems[:5], expected, strict=False):
+        alone = tj.register(one.src, one.dst, noise_bound=one.noise_bound).solution
+        for name in SETS:
+            np.testing.assert_array_equal(getattr(found.selection, name), getattr(alone.selection, name))
+        np.testing.assert_allclose(found.pose.matrix, alone.pose.matrix, atol=1e-12, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("settings", "offered"),
+    [
+        ({}, True),
+        ({"tim_graph": "complete"}, False),
+        ({"clique": "none"}, False),
+        ({"clique": "greedy"}, True),
+    ],
+)
+def test_room_for_every_clique(settings, offered):
+    sizes = np.arange(257)
+    room = rooms(Size(256, None, True), tj.Settings(**settings), sizes)
+    assert np.all((room == NO_ROOM) | (room >= sizes))
+    assert (len(np.unique(room)) > 1) == offered
+    assert np.all(rooms(Size(256, 512, True), tj.Settings(**settings), sizes) == NO_ROOM)  # pairs are given
 
 
 def test_a_stack_comes_back_as_a_stack(many):

@@ -16,14 +16,14 @@ from tqdm import tqdm
 
 from teaser_jax.batch.groups import Size, by_size, centred, pack_list, read_list, read_stack, size_of
 from teaser_jax.batch.processes import all_of, local_mesh, share
-from teaser_jax.batch.programs import programs, unit
-from teaser_jax.packing import PackedProblem, choices_of, fetched, pack_problem, unpack_solution
+from teaser_jax.batch.programs import programs, rooms, unit
+from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
 from teaser_jax.register import check_settings, with_origins, without_padding
-from teaser_jax.stages.clique import Clique, search_batch_on_host
+from teaser_jax.stages.clique import search_batch_on_host
 from teaser_jax.types import Problem, Settings, Solution
 
 WORKERS = 2  # threads: while one is on the host, the other keeps the devices busy
-RUNS_A_CHUNK = 8
+RUNS_A_CHUNK = 4
 
 
 def solve_batch(
@@ -117,7 +117,7 @@ def _solved(
     chunks = [
         (places[k : k + length], problems, slice(k, k + length))
         for places, problems in parts
-        for length in [solver.length(problems, chunk_size)]
+        for length in [solver.length(problems, chunk_size, len(places))]
         for k in range(0, len(places), length)
     ]
     with (
@@ -167,10 +167,13 @@ class Solver:
         """Problems in one run of the programs."""
         return unit(size, self.mesh.devices.flat[0]) * self.mesh.size
 
-    def length(self, problems: Problem | list[Problem], chunk_size: int | None) -> int:
-        """Problems in a chunk: whole runs."""
+    def length(self, problems: Problem | list[Problem], chunk_size: int | None, count: int) -> int:
+        """Problems in a chunk, of so many: whole runs, and by default something for every thread."""
         run = self.run_length(size_of(problems if isinstance(problems, Problem) else problems[0]))
-        return run * (RUNS_A_CHUNK if chunk_size is None else -(-int(chunk_size) // run))
+        runs = (
+            min(RUNS_A_CHUNK, -(-count // (WORKERS * run))) if chunk_size is None else -(-chunk_size // run)
+        )
+        return run * runs
 
     def solve(self, problems: Problem | list[Problem], rows: slice) -> Solution:
         """A chunk, in its own frames; of a stack without padding, of a list with it."""
@@ -182,42 +185,49 @@ class Solver:
         return self._solve(pack_list(problems[rows], self.settings, size), size)
 
     def _solve(self, sent: PackedProblem, size: Size) -> Solution:
-        ready = centred(sent)
-        length, answers = self.run_length(size), []
-        order = np.argsort(~ready.narrow, kind="stable")  # those whose edges float32 tests come first
-        for narrow in (True, False):
-            of_kind = order[ready.narrow[order] == narrow]
-            for k in range(0, len(of_kind), length):
-                some = of_kind[k : k + length]
-                answers.append(
-                    (some, self._run(jax.tree.map(lambda x, i=some: x[i], ready.sent), narrow, length))
-                )
-        places = np.concatenate([some for some, _ in answers])
-        back = np.argsort(places)
-        solution = jax.tree.map(lambda *x: np.concatenate(x)[back], *[answer for _, answer in answers])
-        return solution if ready.origins is None else with_origins(solution, *ready.origins)
-
-    def _run(self, sent: PackedProblem, narrow: bool, length: int) -> Solution:
-        """One run of both programs, with the host's search between them where a clique has no proof."""
-        count, settings = len(sent.columns), self.settings
-        sent = jax.tree.map(lambda x: _repeated(x, length), sent)
-        sent.columns[count:, 8] = 0  # what fills the run is masked
+        ready, settings = centred(sent), self.settings
+        sent = ready.sent
         compiled = programs(choices_of(settings), self.mesh)
         with jax.enable_x64(True):  # of this thread only
-            on_device = jax.device_put(sent, compiled.sharding)
-            graph, found, proved = compiled.before(on_device, narrow)
-            searched = settings.clique in ("exact", "networkx")
-            if searched and (settings.clique == "networkx" or not np.asarray(proved)[:count].all()):
-                mask = sent.columns[:, 8] > 0
-                found = search_batch_on_host(
-                    graph.edge_bits, mask, *found, method=settings.clique,
+            graph, clique, proved = self._in_runs(compiled.before, ready.narrow, (sent,), size)
+            if settings.clique == "networkx" or (settings.clique == "exact" and not proved.all()):
+                clique = search_batch_on_host(
+                    graph.edge_bits, sent.mask, *clique, method=settings.clique,
                     nodes=settings.clique_nodes, seconds=settings.clique_seconds,
                 )  # fmt: skip
-                found = jax.device_put(Clique(*found), compiled.sharding)
-            packed = fetched(compiled.after(on_device, graph, found))
-        return unpack_solution(jax.tree.map(lambda x: x[:count], packed))
+            room = rooms(size, settings, np.sum(clique.members, axis=1))
+            solution = unpack_solution(self._in_runs(compiled.after, room, (sent, graph, clique), size))
+        return solution if ready.origins is None else with_origins(solution, *ready.origins)
+
+    def _in_runs(self, program: Any, choice: np.ndarray, arrays: tuple[Any, ...], size: Size) -> Any:
+        """What a program makes of each problem, in numpy; those that make the same choice share runs."""
+        length, sharding = self.run_length(size), programs(choices_of(self.settings), self.mesh).sharding
+        launched = []
+        for each in np.unique(choice):
+            alike = np.flatnonzero(choice == each)
+            for k in range(0, len(alike), length):
+                some = alike[k : k + length]
+                sent = jax.device_put(_filled_up(arrays, some, length), sharding)
+                launched.append((some, program(*sent, each.item())))
+        order = np.concatenate([some for some, _ in launched])
+        parts = [_fetched(answer, len(some)) for some, answer in launched]
+        whole = jax.tree.map(lambda *x: np.concatenate(x), *parts) if len(parts) > 1 else parts[0]
+        if np.all(order[:-1] < order[1:]):
+            return whole
+        back = np.argsort(order)
+        return jax.tree.map(lambda x: x[back], whole)
 
 
-def _repeated(x: Any, length: int) -> Any:
-    """An array of its own with rows up to a length, the first one repeated."""
-    return np.concatenate([x, np.repeat(x[:1], length - len(x), axis=0)])
+def _fetched(arrays: Any, count: int) -> Any:
+    """The first rows, in numpy."""
+    return jax.tree.map(lambda x: np.asarray(x)[:count], arrays)
+
+
+def _filled_up(arrays: tuple[Any, ...], some: Int[np.ndarray, " k"], length: int) -> tuple[Any, ...]:
+    """These rows of problems, graphs and cliques; what fills the run repeats the first, and is masked."""
+    fill = np.append(some, np.repeat(some[:1], length - len(some)))
+    if some[-1] - some[0] == length - 1:  # all in one piece: nothing is copied
+        return jax.tree.map(lambda x: x[some[0] : some[0] + length], arrays)
+    sent, *rest = jax.tree.map(lambda x: x[fill], arrays)
+    sent.columns[len(some) :, 8] = 0
+    return (sent, *rest)

@@ -192,11 +192,11 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
     # Component by component: pairs of turns and matches are met in one pass and never stored.
     which = jnp.arange(len(TURNS), dtype=jnp.int32) % jnp.maximum(jnp.sum(inliers, dtype=jnp.int32), 1)
     pivots = bits.listed(inliers)[which]
-    turns = jnp.sum(jnp.asarray(TURNS, src.dtype)[:, :, :, None] * pose.rotation, axis=2)
-    a, b = src[pivots], dst[pivots]
+    a, b, entries = src[pivots], dst[pivots], jnp.asarray(TURNS, src.dtype).T  # (k, j) of all turns in a row
     residual2 = jnp.zeros((), src.dtype)
     for i in range(3):
-        moved = sum(turns[:, i, j, None] * (src[:, j] - a[:, j, None]) for j in range(3))
+        turned = [sum(entries[k, i] * pose.rotation[k, j] for k in range(3)) for j in range(3)]
+        moved = sum(turned[j][:, None] * (src[:, j] - a[:, j, None]) for j in range(3))
         residual2 += (dst[:, i] - b[:, i, None] - pose.scale * moved) ** 2
     agree = (residual2 <= problem.cbar2 * problem.noise_bound**2) & mask
     return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
