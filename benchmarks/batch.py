@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -94,7 +95,9 @@ def proved_on_device(stack: tj.Problem) -> np.ndarray:
 def run(quick: bool) -> list[dict]:
     """A row a cell; the peer's processes are started once."""
     rows = []
-    # Started afresh: a process that has threads must not be forked.
+    # Started afresh: a process that has threads must not be forked. Threads of their own would wait for one
+    # another, a hundred times slower.
+    os.environ["OMP_NUM_THREADS"] = "1"
     pool = ProcessPoolExecutor(PEER_PROCESSES, get_context("spawn")) if PEER in PEERS else None
     try:
         for n, count, wanted in CELLS:

@@ -99,12 +99,27 @@ def by_size(problems: Sequence[Problem]) -> dict[Size, Int[np.ndarray, " b"]]:
 
 
 def pack_list(problems: Sequence[Problem], settings: Settings, size: Size) -> PackedProblem:
-    """Problems of one size as one batch on the host."""
-    packed = [pack_problem(problem, settings, size.n, size.m) for problem in problems]
-    pairs = None if size.m is None else np.stack([np.asarray(each.pairs) for each in packed])
-    return PackedProblem(
-        np.stack([each.columns for each in packed]), np.stack([each.numbers for each in packed]), pairs
-    )
+    """Problems of one size as one batch on the host; those of as many rows are packed together."""
+    whole: Any = None
+    for rows in by_shape(problems).values():
+        alike = [problems[k] for k in rows]
+        packed = pack_problem(jax.tree.map(lambda *x: np.stack(x), *alike), settings, size.n, size.m)
+        if len(rows) == len(problems):
+            return packed
+        if whole is None:
+            whole = jax.tree.map(lambda x: np.empty((len(problems), *x.shape[1:]), x.dtype), packed)
+        for into, part in zip(jax.tree.leaves(whole), jax.tree.leaves(packed), strict=True):
+            into[rows] = part
+    return whole
+
+
+def by_shape(problems: Sequence[Problem]) -> dict[tuple[int, int | None], list[int]]:
+    """The places of the problems of each number of rows and of pairs."""
+    places: dict[tuple[int, int | None], list[int]] = {}
+    for k, problem in enumerate(problems):
+        m = None if problem.pairs is None else problem.pairs.shape[0]
+        places.setdefault((problem.src.shape[0], m), []).append(k)
+    return places
 
 
 class Ready(NamedTuple):

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 from jaxtyping import Int
 from tqdm import tqdm
 
-from teaser_jax.batch.groups import Size, by_size, centred, pack_list, read_list, read_stack, size_of
+from teaser_jax.batch.groups import Size, by_shape, by_size, centred, pack_list, read_list, read_stack, size_of
 from teaser_jax.batch.processes import all_of, local_mesh, share
 from teaser_jax.batch.programs import programs, rooms, unit
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
@@ -150,9 +150,11 @@ def _listed(chunks: Iterator[Chunk], problems: list[Problem]) -> list[Solution]:
     """One solution a problem, in its own rows."""
     answers: list[Any] = [None] * len(problems)
     for places, solution in chunks:
-        for row, place in enumerate(places):
-            one = jax.tree.map(lambda x, row=row: x[row], solution)
-            answers[place] = without_padding(one, problems[place])
+        chunk = [problems[place] for place in places]
+        for rows in by_shape(chunk).values():
+            leaves, form = jax.tree.flatten(without_padding(solution, chunk[rows[0]]))
+            for row in rows:
+                answers[places[row]] = form.unflatten([leaf[row] for leaf in leaves])
     return answers
 
 
