@@ -77,6 +77,7 @@ def test_answers_are_ordinary_solutions(many, answers):
     for leaf in jax.tree.leaves(answers[0]):
         assert isinstance(leaf, np.ndarray | np.generic)
         assert leaf.dtype.kind != "f" or leaf.dtype == np.float64
+        assert np.ndim(leaf) == 0 or leaf.flags.writeable
     assert not jax.config.jax_enable_x64
 
 

@@ -14,7 +14,16 @@ from jax.sharding import Mesh
 from jaxtyping import Int
 from tqdm import tqdm
 
-from teaser_jax.batch.groups import Size, by_shape, by_size, centred, pack_list, read_list, read_stack, size_of
+from teaser_jax.batch.groups import (
+    Size,
+    by_shape,
+    by_size,
+    centred,
+    pack_list,
+    read_list,
+    read_stack,
+    size_of,
+)
 from teaser_jax.batch.processes import all_of, local_mesh, share
 from teaser_jax.batch.programs import programs, rooms, unit
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
@@ -36,10 +45,10 @@ def solve_batch(
 ) -> list[Solution] | Solution:
     """``solve`` for thousands of problems, on every device there is; outside jit, in float64.
 
-    Problems are sorted by size, padded to the sizes of ``register`` and solved some at a time by one
-    compiled program a size. An answer depends on its own problem alone, bit for bit: not on its
-    neighbours, their order, the chunks or the number of devices. A problem that cannot be solved says
-    so in its status.
+    Problems are sorted by size, padded to the sizes of ``register`` and solved some at a time by a few
+    compiled programs a size: one up to the clique, and one for each of up to four classes of clique sizes.
+    An answer depends on its own problem alone, bit for bit: not on its neighbours, their order, the
+    chunks or the number of devices. A problem that cannot be solved says so in its status.
 
     Points are read as they are; ``make_problem`` rounds to float32 unless JAX's x64 is on, and
     ``host_problem`` does not.
@@ -213,7 +222,7 @@ class Solver:
                 launched.append((some, program(*sent, each.item())))
         order = np.concatenate([some for some, _ in launched])
         parts = [_fetched(answer, len(some)) for some, answer in launched]
-        whole = jax.tree.map(lambda *x: np.concatenate(x), *parts) if len(parts) > 1 else parts[0]
+        whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)  # may be written to, as numpy's may
         if np.all(order[:-1] < order[1:]):
             return whole
         back = np.argsort(order)
