@@ -163,7 +163,7 @@ def _listed(chunks: Iterator[Chunk], problems: list[Problem]) -> list[Solution]:
         for rows in by_shape(chunk).values():
             leaves, form = jax.tree.flatten(without_padding(solution, chunk[rows[0]]))
             for row in rows:
-                answers[places[row]] = form.unflatten([leaf[row] for leaf in leaves])
+                answers[places[row]] = jax.tree.unflatten(form, [leaf[row] for leaf in leaves])
     return answers
 
 
