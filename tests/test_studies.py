@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -203,6 +204,18 @@ def test_the_report_has_a_row_for_every_figure_table_and_competitor(quick, tmp_p
         assert table in text
     with pytest.raises(FileError, match="holds no study"):
         write_report(tmp_path, tmp_path / "none.md")
+
+
+def test_the_report_tells_of_other_models_in_folders_of_their_own(quick, tmp_path):
+    folder = shutil.copytree(quick, tmp_path / "studies")
+    cloud = Model("cloud", np.random.default_rng(0).standard_normal((400, 3)))
+    run_study("known-scale", folder / "cloud", quick=True, model=cloud, methods=["teaser_jax"])
+    text = write_report(folder, tmp_path / "PAPER.md").read_text()
+    assert "| right, at least: cloud: known-scale 100% to 90% | yes |" in text
+    section = text[text.index("\n### cloud\n") :]
+    assert "model: cloud; 3 runs a box (Fig. 6a)" in section
+    assert "| teaser_jax | 100% | 100% | 100% |" in section
+    assert "### cloud" not in write_report(quick, tmp_path / "alone.md").read_text()
 
 
 def test_claims_are_tested_and_not_believed(quick):

@@ -6,12 +6,13 @@ import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from teaser_jax.files import FileError, whole
 from teaser_jax.studies.catalogue import LABELS, MATCHES, Measure, studies
-from teaser_jax.studies.claims import CLAIMS, COMPETITORS, Claim, Verdict, median
+from teaser_jax.studies.claims import CLAIMS, COMPETITORS, Claim, Models, Verdict, median
 from teaser_jax.studies.results import ABOUT, PICTURE, Results, read_results
 
 MARKS = {True: "yes", False: "**no**", None: "-"}
@@ -21,25 +22,33 @@ def write_report(folder: str | Path, output: str | Path) -> Path:
     """Write ``PAPER.md`` from the tables of the studies in a folder; nothing in it is written by hand.
 
     Args:
-        folder: Where ``run_study`` put the studies; those that are missing are said to be.
+        folder: Where ``run_study`` put the studies; those that are missing are said to be. Folders in it may
+            hold the same studies of other models, as ``FOLDER/bunny/known-scale``.
         output: The file, which appears whole or not at all. It shows the figures by relative paths.
 
     Raises:
         FileError: If there is no study in the folder, a table is broken, or the file cannot be written.
     """
     folder, output = Path(folder), Path(output)
-    found = {name: read_results(folder / name) for name in studies() if (folder / name / ABOUT).exists()}
+    found = _studies_in(folder)
     if not found:
         raise FileError(f"{folder}: holds no study: run teaser-jax study first.")
+    inner = {path.name: _studies_in(path) for path in sorted(folder.iterdir()) if path.name not in studies()}
+    models = {name: some for name, some in inner.items() if some}
     try:
         with whole(output) as partial:
-            partial.write_text("\n".join(_report(found, folder, output.parent)) + "\n", encoding="utf-8")
+            text = "\n".join(_report(found, models, folder, output.parent))
+            partial.write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise FileError(f"{output}: cannot be written: {error.strerror or error}.") from error
     return output
 
 
-def _report(found: dict[str, Results], folder: Path, here: Path) -> Iterator[str]:
+def _studies_in(folder: Path) -> dict[str, Results]:
+    return {name: read_results(folder / name) for name in studies() if (folder / name / ABOUT).exists()}
+
+
+def _report(found: dict[str, Results], models: Models, folder: Path, here: Path) -> Iterator[str]:
     yield "# The paper, reproduced"
     yield ""
     yield (
@@ -48,7 +57,7 @@ def _report(found: dict[str, Results], folder: Path, here: Path) -> Iterator[str
         "this page from them, on any machine."
     )
     yield ""
-    yield from _claims(found)
+    yield from _claims(found, models)
     yield from _competitors(found)
     for name, study in studies().items():
         yield f"## {name}"
@@ -58,9 +67,31 @@ def _report(found: dict[str, Results], folder: Path, here: Path) -> Iterator[str
         else:
             yield f"Not run: `teaser-jax study {name}` ({study.figure}, {study.title})."
             yield ""
+    yield from _other_models(models)
 
 
-def _claims(found: dict[str, Results]) -> Iterator[str]:
+def _other_models(models: Models) -> Iterator[str]:
+    if not models:
+        return
+    yield "## Other models"
+    yield ""
+    yield "Share of right answers where the points are drawn from another model."
+    yield ""
+    for name, found in models.items():
+        yield f"### {name}"
+        yield ""
+        for results in found.values():
+            about = results.about
+            yield (
+                f"{results.title}; seed {about['seed']}. `teaser-jax study {results.study.name} --model ... "
+                f"--folder .../{name}`"
+            )
+            yield ""
+            yield from _successes(results)
+        yield from _made_with([made for results in found.values() for made in results.about["made_with"]])
+
+
+def _claims(found: dict[str, Results], models: Models) -> Iterator[str]:
     yield "## Every figure and table"
     yield ""
     yield "A **no** beside another library means that it does better here than in the paper."
@@ -68,12 +99,14 @@ def _claims(found: dict[str, Results]) -> Iterator[str]:
     yield "| paper | what it reports | here | reproduced |"
     yield "|---|---|---|---|"
     for claim in CLAIMS:
-        verdict = _verdict(claim, found)
+        verdict = _verdict(claim, found, models)
         yield f"| {claim.where} | {claim.said} | {verdict.found} | {MARKS[verdict.holds]} |"
     yield ""
 
 
-def _verdict(claim: Claim, found: dict[str, Results]) -> Verdict:
+def _verdict(claim: Claim, found: dict[str, Results], models: Models) -> Verdict:
+    if claim.of_models is not None:
+        return claim.of_models(models)
     if claim.study is None or claim.test is None:
         return Verdict(claim.reason)
     if claim.study not in found:
@@ -100,7 +133,7 @@ def _section(results: Results, place: Path) -> Iterator[str]:
     yield ""
     yield "Share of right answers."
     yield ""
-    yield from _grid(results, results.methods, lambda m, v: f"{results.success(m, v):.0%}")
+    yield from _successes(results)
     for measure in results.study.measures:
         having = [m for m in results.methods if results.has(m, measure.column)]
         yield f"Median {measure.label}."
@@ -111,7 +144,17 @@ def _section(results: Results, place: Path) -> Iterator[str]:
         first = failed[0]
         yield f"{len(failed)} runs of other libraries raised; first {first['method']}: {first['error']}"
         yield ""
-    for made in about["made_with"]:
+    yield from _made_with(about["made_with"])
+
+
+def _successes(results: Results) -> Iterator[str]:
+    yield from _grid(results, results.methods, lambda m, v: f"{results.success(m, v):.0%}")
+
+
+def _made_with(environments: list[dict[str, Any]]) -> Iterator[str]:
+    for k, made in enumerate(environments):
+        if made in environments[:k]:
+            continue
         versions = ", ".join(f"{package} {version}" for package, version in made["versions"].items())
         yield f"*{made['processor']}; {made['devices']}; python {made['python']}; {versions}*"
         yield ""
