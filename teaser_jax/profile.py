@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import jax
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from teaser_jax.checks import whole_number
 from teaser_jax.packing import pack_problem
 from teaser_jax.problem import finite_rows, is_traced, pad_problem
 from teaser_jax.register import (
@@ -77,8 +77,7 @@ def profile(
     Raises:
         ValueError: As ``register``, and if ``repeats`` is below 1.
     """
-    if isinstance(repeats, bool) or not isinstance(repeats, Integral) or repeats < 1:
-        raise ValueError(f"repeats is {repeats!r}: time each stage at least once, after its first call.")
+    whole_number("repeats", repeats, 1, what="how often to time each stage after its first call")
     check_settings(settings)
     if is_traced(src, dst, settings, known):
         raise ValueError(INSIDE_JIT.replace("register", "profile"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from numbers import Integral
 from typing import Any
 
 import jax
@@ -16,6 +15,7 @@ from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import compile_ahead
 from teaser_jax.certify.pose import MAX_TRACED
 from teaser_jax.certify.pose import certify as certify_pose
+from teaser_jax.checks import whole_number
 from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.packing import (
     PackedProblem,
@@ -182,8 +182,7 @@ def warmup(
     Raises:
         ValueError: If ``max_points`` is below 1, or the settings make no sense.
     """
-    if isinstance(max_points, bool) or not isinstance(max_points, Integral) or max_points < 1:
-        raise ValueError(f"max_points is {max_points!r}: expected the largest number of matches to come.")
+    whole_number("max_points", max_points, 1, what="the largest number of matches to come")
     sizes = sorted({bucket(n) for n in range(1, max_points + 1)})
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], float)
     for size in sizes:

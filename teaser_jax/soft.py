@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from numbers import Integral
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
+from teaser_jax.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.solve import check_records, solve, usable_rows
 from teaser_jax.stages.gnc import gnc_cost, gnc_weights
@@ -111,8 +111,7 @@ def soft_solve(
         not is_traced(gnc_mu) and not (np.isfinite(float(gnc_mu)) and float(gnc_mu) > 0)
     ):
         raise ValueError(f"gnc_mu is {gnc_mu}: expected one finite number above 0.")
-    if isinstance(iterations, bool) or not isinstance(iterations, Integral) or iterations < 1:
-        raise ValueError(f"iterations is {iterations!r}: expected a whole number, 1 or above.")
+    whole_number("iterations", iterations, 1)
     start = solve(lax.stop_gradient(problem), lax.stop_gradient(settings))
     p, _ = usable_rows(problem)
     dtype = p.src.dtype

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from dataclasses import dataclass, field
 from functools import partial
-from numbers import Integral, Real
+from numbers import Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import jax
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
+from teaser_jax.checks import whole_number
 from teaser_jax.so3 import AnyArray
 
 if TYPE_CHECKING:
@@ -140,9 +141,7 @@ class Settings:
                 allowed = ", ".join(repr(x) for x in get_args(kind))
                 raise ValueError(f"Settings.{name} is {getattr(self, name)!r}: expected one of {allowed}.")
         for name in ("gnc_iterations", "refine_iterations", "clique_nodes"):
-            cap = getattr(self, name)
-            if isinstance(cap, bool) or not isinstance(cap, Integral) or not 0 < int(cap) < 2**31:
-                raise ValueError(f"Settings.{name} is {cap!r}: expected a whole number from 1 to 2^31 - 1.")
+            whole_number(f"Settings.{name}", getattr(self, name), 1)
         if not isinstance(self.refine, bool):
             raise ValueError(f"Settings.refine is {self.refine!r}: expected True or False.")
         if isinstance(self.gnc_factor, str) or isinstance(self.gnc_tolerance, str):

@@ -29,10 +29,10 @@ from teaser_jax.certify.rotation import (
     TOLERANCE,
     as_mask,
     certify_rotation,
-    check_count,
     check_tolerance,
     default_iterations,
 )  # fmt: skip
+from teaser_jax.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.stages.quadratic_form import in_frame_of
@@ -124,7 +124,7 @@ def solve_rotation(
         )
     k = np.shape(src)[0]
     mask = np.ones(k, bool) if mask is None else mask
-    rounds = default_iterations(k) if iterations is None else check_count("iterations", iterations)
+    rounds = default_iterations(k) if iterations is None else whole_number("iterations", iterations, 0)
     if any(np.iscomplexobj(x) for x in (src, dst) if not is_traced(x)):
         raise ValueError("src and dst are real; complex numbers were received.")
     if is_traced(src, dst, noise_bound, cbar2, mask, tolerance):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import jax
@@ -26,6 +25,7 @@ from teaser_jax.batch.groups import (
 )
 from teaser_jax.batch.processes import all_of, local_mesh, share
 from teaser_jax.batch.programs import programs, rooms, unit
+from teaser_jax.checks import whole_number
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
 from teaser_jax.register import check_settings, with_origins, without_padding
 from teaser_jax.stages.clique import search_batch_on_host
@@ -75,10 +75,8 @@ def solve_batch(
     check_settings(settings)
     if settings.rotation == "sdp":
         raise ValueError('Settings(rotation="sdp") is solved on the host, one by one: use solve or register.')
-    if chunk_size is not None and (
-        isinstance(chunk_size, bool) or not isinstance(chunk_size, Integral) or chunk_size < 1
-    ):
-        raise ValueError(f"chunk_size is {chunk_size!r}: expected the number of problems to send at a time.")
+    if chunk_size is not None:
+        chunk_size = whole_number("chunk_size", chunk_size, 1, what="how many problems to send")
     if mesh is not None and not isinstance(mesh, Mesh):
         raise ValueError(f"mesh is of type {type(mesh).__name__}: expected a jax.sharding.Mesh.")
     if isinstance(problems, Problem):

@@ -14,7 +14,6 @@ the row space of A, which is all but zero for a least squares fit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Integral
 from typing import NamedTuple
 
 import jax
@@ -23,6 +22,7 @@ from jaxtyping import Float
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.pose import certify
+from teaser_jax.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.solve import cascade_pose
 from teaser_jax.types import Pose, Problem, Solution
@@ -148,8 +148,7 @@ def error_bounds(
     """
     if is_traced(problem, solution) or np.ndim(solution.status) != 0:
         raise ValueError("error_bounds takes one problem and runs outside jit: give it the items one by one.")
-    if isinstance(wrong, bool) or not isinstance(wrong, Integral) or wrong < 0:
-        raise ValueError(f"wrong is {wrong!r}: expected the number of inliers that may be wrong, 0 or more.")
+    whole_number("wrong", wrong, 0, what="the number of inliers that may be wrong")
     double = lambda x: np.asarray(x, np.float64) if np.asarray(x).dtype.kind == "f" else np.asarray(x)
     p, s = jax.tree.map(double, (problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate

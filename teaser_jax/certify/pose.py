@@ -20,11 +20,11 @@ from teaser_jax.certify.rotation import (
     MAX_MEASUREMENTS,
     TOLERANCE,
     certify_rotation,
-    check_count,
     check_tolerance,
     default_iterations,
 )  # fmt: skip
 from teaser_jax.certify.stack import certify_stack
+from teaser_jax.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.solve import cascade_pose, usable_rows
@@ -91,9 +91,9 @@ def certify(
     if method not in ("splitting", "direct", "reference"):
         raise ValueError(f"method is {method!r}: expected 'splitting', 'direct' or 'reference'.")
     if iterations is not None:
-        check_count("iterations", iterations)
+        whole_number("iterations", iterations, 0)
     if max_measurements is not None:
-        check_count("max_measurements", max_measurements)
+        whole_number("max_measurements", max_measurements, 0)
     if is_traced(problem, solution):
         if np.ndim(solution.status) != 0:
             raise ValueError("the solution is a stack: inside jit use jax.vmap(certify).")

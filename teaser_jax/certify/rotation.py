@@ -7,7 +7,7 @@ speaks of these measurements: it says optimal, never right.
 from __future__ import annotations
 
 from dataclasses import replace
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import jax
@@ -20,6 +20,7 @@ from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import certify_rows, compacted
 from teaser_jax.certify.proof import CertifyMethod, prove
 from teaser_jax.certify.stack import certify_stack
+from teaser_jax.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.stages.quadratic_form import in_frame_of
@@ -81,9 +82,9 @@ def certify_rotation(
     shape = _check(src, dst, rotation, method)
     mask = np.ones(shape[:-1], bool) if mask is None else mask
     iterations = (
-        default_iterations(shape[-2]) if iterations is None else check_count("iterations", iterations)
+        default_iterations(shape[-2]) if iterations is None else whole_number("iterations", iterations, 0)
     )
-    check_count("max_measurements", max_measurements)
+    whole_number("max_measurements", max_measurements, 0)
     if is_traced(src, dst, rotation, noise_bound, cbar2, mask, tolerance):
         if len(shape) != 2:
             raise ValueError("a stack of problems was given inside jit: use jax.vmap(certify_rotation).")
@@ -145,13 +146,6 @@ def _checked(rotation: Any) -> np.ndarray:
     if not np.all(np.isfinite(rotation)):
         raise ValueError(f"rotation is not finite: {rotation.tolist()}.")
     return rotation
-
-
-def check_count(name: str, value: Any) -> int:
-    """A whole number, 0 or above, or ValueError."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= int(value) < 2**31:
-        raise ValueError(f"{name} is {value!r}: expected a whole number from 0 to 2^31 - 1.")
-    return int(value)
 
 
 def check_tolerance(value: Any) -> float:

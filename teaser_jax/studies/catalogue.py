@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from teaser_jax import synthetic
+from teaser_jax.checks import whole_number
 from teaser_jax.studies import methods as m
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.peers import find_peers
-from teaser_jax.studies.trials import Draw, Model, Trial, seed_of, whole_number
+from teaser_jax.studies.trials import Draw, Model, StudyError, Trial, seed_of
 from teaser_jax.synthetic import SyntheticProblem
 from teaser_jax.types import Pose
 
@@ -77,7 +78,8 @@ class Study:
 
     def cells(self, runs: int | None = None, *, quick: bool = False) -> list[tuple[float, range]]:
         """The values and the numbers of their runs; StudyError if there would be none."""
-        count = (QUICK_RUNS if quick else self.runs) if runs is None else whole_number("runs", runs, 1)
+        usual = QUICK_RUNS if quick else self.runs
+        count = usual if runs is None else whole_number("runs", runs, 1, error=StudyError)
         return [(value, range(count)) for value in (self.quick_values if quick else self.values)]
 
     def trial(self, seed: int, value: float, number: int, model: Model) -> Trial:

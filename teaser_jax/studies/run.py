@@ -23,7 +23,7 @@ from teaser_jax.studies.figures import check_drawing, draw_study
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.results import ABOUT, TABLE
 from teaser_jax.studies.table import Table, written
-from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, whole_number
+from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, check_seed
 
 PACKAGES = ("teaser-jax", "jax", "jaxlib", "numpy", "numba", "scs", "kiss-matcher", "open3d-cpu", "open3d")
 PROTOCOL = 1  # raised when a study draws other problems for the same seed
@@ -79,7 +79,7 @@ def run_study(
     study = named_study(name)
     chosen = _chosen(study, methods, quick)
     cells = study.cells(runs, quick=quick)
-    seed = whole_number("seed", seed, 0)
+    seed = check_seed(seed)
     place = Path(folder) / name
     with ExitStack() as stack:
         table, known, failure = None, set(), None

@@ -11,7 +11,7 @@ import numpy as np
 
 from teaser_jax.files import FileError, read_archive, whole
 from teaser_jax.studies.catalogue import Study
-from teaser_jax.studies.trials import TEAPOT, Model, Trial, whole_number
+from teaser_jax.studies.trials import TEAPOT, Model, Trial, check_seed
 from teaser_jax.synthetic import SyntheticProblem
 from teaser_jax.types import Pose
 
@@ -32,7 +32,7 @@ def draw_trials(
     """
     for value, numbers in study.cells(runs, quick=quick):
         for number in numbers:
-            yield study.trial(whole_number("seed", seed, 0), value, number, model)
+            yield study.trial(check_seed(seed), value, number, model)
 
 
 def save_trials(

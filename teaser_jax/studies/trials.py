@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import Any, TypeAlias
 from zlib import crc32
 
 import numpy as np
 
+from teaser_jax.checks import whole_number
 from teaser_jax.files import FileError, one_line
 from teaser_jax.problem import Problem
 from teaser_jax.register import host_problem
@@ -62,11 +62,9 @@ def seed_of(study: str, seed: int, value: float, number: int) -> tuple[int, ...]
     return seed, crc32(study.encode()), round(10_000 * value), number
 
 
-def whole_number(name: str, value: Any, least: int) -> int:
-    """An argument that counts; StudyError if it is none or below the least."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise StudyError(f"{name} is {value!r}: expected a whole number, {least} or above.")
-    return int(value)
+def check_seed(seed: Any) -> int:
+    """The seed of a study, of any size; StudyError if it is none."""
+    return whole_number("seed", seed, 0, below=None, error=StudyError)
 
 
 def read_model(path: str | Path) -> Model:
