@@ -349,7 +349,9 @@ def with_origins(solution: Solution, src_origin: np.ndarray, dst_origin: np.ndar
     """The solution of centred clouds (or of a stack of them) in the frames that these came from."""
     pose = solution.pose
     turned = so3.rotate(pose.rotation, src_origin[..., None, :])[..., 0, :]
-    translation = dst_origin + pose.translation - pose.scale[..., None] * turned
+    with np.errstate(over="ignore", invalid="ignore"):  # of points at the end of all numbers
+        translation = dst_origin + pose.translation - pose.scale[..., None] * turned
+    translation = np.where(np.isfinite(translation), translation, 0)
     return replace(solution, pose=Pose(pose.rotation, translation, np.asarray(pose.scale)))
 
 

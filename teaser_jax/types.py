@@ -288,7 +288,7 @@ class Solution:
     """The answer of ``solve``. Finite even when ``status`` says that it failed.
 
     Attributes:
-        pose: Equal to ``refit(problem, selection)``.
+        pose: Equal to ``refit(problem, selection)``, if there is an inlier.
         selection: The sets behind the pose.
         inliers: ``selection.inliers``, in the user's order.
         status: A ``Status`` as int32; the first failure sticks.

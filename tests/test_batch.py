@@ -149,6 +149,9 @@ POISON = {
     "all wrong": lambda p: problem(1234, rate=1.0),
     "empty": lambda p: jax.tree.map(lambda x: x[:0] if np.ndim(x) else x, p),
     "huge": lambda p: dataclasses.replace(p, src=p.src * 1e300),
+    "at the end of all numbers": lambda p: dataclasses.replace(
+        p, src=np.full((30, 3), 1.7e308), dst=np.full((30, 3), -1.7e308)
+    ),
 }
 
 
@@ -196,11 +199,22 @@ def test_nothing_and_bad_input():
     for wrong in (
         {"mask": np.full(30, np.nan)}, {"src": good.src * 1j}, {"noise_bound": None},
         {"pairs": np.full((3, 2), 0.5)},
+        {"src": np.zeros((30, 3), [("x", float)])}, {"src": [[1, 2, 3], [4]]},
     ):  # fmt: skip
         with pytest.raises(ValueError, match="make problems with make_problem"):
             tj.solve_batch([dataclasses.replace(good, **wrong)])
+    with pytest.raises(ValueError, match=r"problems\[0\] has src with hidden entries"):
+        tj.solve_batch([dataclasses.replace(good, src=np.ma.masked_less(good.src, 0))])
+    with pytest.raises(ValueError, match=r"problems\[0\] has src without numbers"):
+        tj.solve_batch([jax.eval_shape(lambda p: p, good)])
+    with pytest.raises(ValueError, match=r"src of shape \(3, 30\): expected \(..., n, 3\)"):
+        tj.solve_batch([dataclasses.replace(good, src=good.src.T)])
     with pytest.raises(ValueError, match="expected a jax.sharding.Mesh"):
         tj.solve_batch([good], mesh=jax.devices())
+    with pytest.raises(ValueError, match="mesh has no device"):
+        tj.solve_batch([good], mesh=jax.sharding.Mesh(np.empty(0, object), ("x",)))
+    with pytest.raises(ValueError, match="expected a list"):
+        tj.solve_batch("")
     with pytest.raises(ValueError, match="expected a list"):
         tj.solve_batch(p for p in [good])
     with pytest.raises(ValueError, match="chunk_size is 0"):
@@ -241,4 +255,4 @@ def test_two_processes_share_the_work():
         port = probe.getsockname()[1]
     both = [run("two_processes.py", f"127.0.0.1:{port}", 2, k) for k in range(2)]
     said = [json.loads(each.communicate(timeout=300)[0].splitlines()[-1]) for each in both]
-    assert said == [{"processes": 2, "same": True, "shares": [5, 6]}] * 2
+    assert said == [{"processes": 2, "same": True, "shares": [5, 6], "refused": True}] * 2

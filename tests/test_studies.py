@@ -115,6 +115,60 @@ def read_table_of(content, folder):
     return read_table(folder / "other.csv")
 
 
+@pytest.mark.parametrize(
+    "content", [b"name,score\nann,1\nbob,2", b"notes of one line", b"\x00\xff", b"outlier_rate,x"]
+)
+def test_a_file_of_somebody_else_is_left_as_it_is(tmp_path, content):
+    table = tmp_path / "translation" / "table.csv"
+    table.parent.mkdir()
+    table.write_bytes(content)
+    with pytest.raises(FileError, match="holds other columns than this study writes: name another folder"):
+        run_study("translation", tmp_path, quick=True, methods=TLS)
+    assert table.read_bytes() == content
+
+
+def test_half_a_header_is_written_again(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"n,tri")
+    with Table(path, ("n", "trial", "method")) as table:
+        table.append([{"n": 1, "trial": 0, "method": "TLS"}])
+    assert path.read_bytes() == b"n,trial,method\n1,0,TLS\n"
+
+
+def test_a_full_disk_is_said_and_loses_no_row(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with Table(tmp_path / "table.csv", ("n", "trial", "method")) as table:
+        table.append([{"n": 1, "trial": 0, "method": "TLS"}])
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(FileError, match="No space left on device: the rows before are safe"):
+            table.append([{"n": 1, "trial": 1, "method": "TLS"}])
+    assert read_table(tmp_path / "table.csv")[0] == {"n": 1.0, "trial": 0.0, "method": "TLS"}
+
+
+def test_a_model_that_cannot_be_drawn_from_leaves_no_folder(tmp_path):
+    few = Model("few", np.random.default_rng(0).random((50, 3)))
+    flat = Model("flat", tj.synthetic.Mesh(np.zeros((4, 3)), np.array([[0, 1, 2], [1, 2, 3]])))
+    for model, said in ((few, "50 points, fewer than n = 100"), (flat, "have no area")):
+        with pytest.raises(
+            StudyError, match=f"known-scale cannot draw from the model '{model.name}': .*{said}"
+        ):
+            run_study("known-scale", tmp_path / "s", quick=True, model=model, methods=["teaser_jax"])
+        with pytest.raises(StudyError, match=said):
+            next(iter(draw_trials(studies()["known-scale"], quick=True, model=model)))
+    assert not (tmp_path / "s").exists()
+
+
+def test_figures_without_a_place_are_said(quick, tmp_path):
+    folder = shutil.copytree(quick, tmp_path / "studies")
+    picture = folder / "known-scale" / "figure.png"
+    picture.unlink()
+    picture.mkdir()
+    with pytest.raises(FileError, match="figures cannot be written: Is a directory"):
+        run_study("known-scale", folder, quick=True, runs=2, methods=["teaser_jax"])
+
+
 def test_runs_and_methods_are_added_to_a_table(tmp_path):
     run_study("translation", tmp_path, runs=1, quick=True, methods=TLS)
     first = read_table(tmp_path / "translation" / "table.csv")
@@ -136,14 +190,15 @@ def test_another_model_or_seed_needs_another_folder(tmp_path):
 def test_one_writer_at_a_time(tmp_path):
     pytest.importorskip("fcntl")
     path = tmp_path / "table.csv"
-    with Table(path, ("a", "b")) as table:
-        table.append([{"a": 1.5}, {"a": 2, "b": float("nan")}])
+    columns, key = ("a", "trial", "method", "b"), {"a": 1.5, "trial": 0, "method": "TLS"}
+    with Table(path, columns) as table:
+        table.append([key, key | {"b": float("nan")}])
         with pytest.raises(FileError, match="another program is writing it"):
-            Table(path, ("a", "b"))
+            Table(path, columns)
     with pytest.raises(FileError, match="holds other columns"):
-        Table(path, ("a", "c"))
-    with Table(path, ("a", "b")) as again:
-        assert again.rows[0] == {"a": 1.5}
+        Table(path, (*columns, "c"))
+    with Table(path, columns) as again:
+        assert again.rows[0] == key
         assert np.isnan(again.rows[1]["b"])
 
 
@@ -152,6 +207,11 @@ def test_one_writer_at_a_time(tmp_path):
     [
         ("a,b\n1\n", "line 2 has 1 fields, the header 2"),
         ("a,b\n1,x\n", "line 2: could not convert"),
+        ("n,trial,method\n1,0,TLS\n1,,TLS\n", "line 3 does not say which cell, trial and method"),
+        ("n,trial,method\n1,0.5,TLS\n", "line 2 does not say"),
+        ("n,trial,method\n1,inf,TLS\n", "line 2 does not say"),
+        ("n,trial,method\nnan,0,TLS\n", "line 2 does not say"),
+        ("n,trial,method\n1,0,\n", "line 2 does not say"),
         (None, "run the study first"),
     ],
 )
@@ -394,6 +454,12 @@ def test_the_command(tmp_path, capsys):
         ("scale", "-o", "x.md"),
         ("scale", "--cluster", "here"),
         ("scale", "--cluster", "127.0.0.1:1,2,2"),
+        ("scale", "--cluster", "127.0.0.1:port,2,0"),
+        ("scale", "--cluster", "127.0.0.1:99999,2,0"),
+        ("scale", "--cluster", ":,1,0"),
+        ("scale", "--cluster", "127.0.0.1:1,0,0"),
+        ("scale", "--export", tmp_path, "--method", "TLS"),
+        ("scale", "--model", tmp_path),
         ("report", "--folder", tmp_path / "none"),
     ):
         code, out, err = run(*wrong)

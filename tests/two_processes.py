@@ -23,8 +23,13 @@ def main(address: str, count: str, number: str) -> None:
         and np.allclose(a.pose.matrix, b.pose.matrix, atol=1e-12)
         for k, (a, b) in enumerate(zip(together, alone, strict=True))
     )
+    try:
+        tj.solve_batch(problems[: 10 + int(number)])
+        refused = False
+    except ValueError as error:
+        refused = "each must call with the same ones" in str(error)
     shares = all_of(len(range(11)[share(11, None)]))
-    print(json.dumps({"processes": jax.process_count(), "same": same, "shares": shares}))
+    print(json.dumps({"processes": jax.process_count(), "same": same, "shares": shares, "refused": refused}))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -50,12 +51,25 @@ def _read(problem: Any, axes: int, name: str) -> Problem:
 
     for field in (*FLOATS, "mask", "pairs"):
         value = getattr(problem, field)
+        if isinstance(value, np.ma.MaskedArray):
+            raise ValueError(f"{name} has {field} with hidden entries: make problems with host_problem.")
+        if isinstance(value, jax.ShapeDtypeStruct):
+            raise ValueError(f"{name} has {field} without numbers (of type {type(value).__name__}).")
         dtype = getattr(value, "dtype", None)
         if dtype is USUAL.get(field, DOUBLE) or (value is None and field in ("scale", "pairs")):
             continue
-        dtype = np.asarray(value).dtype if dtype is None else np.dtype(dtype)
-        allowed = {"mask": "b", "pairs": "iu"}.get(field, "fiuV")  # V: numpy's name for bfloat16
-        if dtype.kind not in allowed:
+        try:
+            dtype = np.asarray(value).dtype if dtype is None else np.dtype(dtype)
+        except ValueError as error:
+            raise ValueError(
+                f"{name} has {field} that is no array ({error}): make problems with make_problem."
+            ) from None
+        fits = (
+            dtype.kind in {"mask": "b", "pairs": "iu"}[field]
+            if field in USUAL
+            else dtype.kind in "fiu" or jnp.issubdtype(dtype, jnp.floating)  # bfloat16 is no kind of numpy's
+        )
+        if not fits:
             raise ValueError(f"{name} has {field} of type {dtype}: make problems with make_problem.")
     as_array: Any = np.asarray  # of its many signatures none is that of a field
     given = {field: getattr(problem, field) for field in FLOATS}
@@ -77,7 +91,8 @@ def _read(problem: Any, axes: int, name: str) -> Problem:
     for field, shape in expected.items():
         value = getattr(read, field)
         if value is not None and value.shape != shape:
-            raise ValueError(f"{name} has {field} of shape {value.shape}: expected {shape}.")
+            usual = {"src": "(..., n, 3)", "pairs": "(..., m, 2)"}.get(field) or str(shape)
+            raise ValueError(f"{name} has {field} of shape {value.shape}: expected {usual}.")
     pairs = read.pairs
     if pairs is not None and pairs.size and not 0 <= pairs.min() <= pairs.max() < rows[-1]:
         raise ValueError(f"{name} has pairs of rows that do not exist: rows run from 0 to {rows[-1] - 1}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 from typing import Any
 
@@ -25,6 +26,24 @@ def share(count: int, mesh: Mesh | None) -> slice:
     before = sum(d.process_index < jax.process_index() for d in devices)
     mine = sum(d.process_index == jax.process_index() for d in devices)
     return slice(count * before // len(devices), count * (before + mine) // len(devices))
+
+
+def check_agreement(function: str, given: Any, *, error: type[ValueError] = ValueError) -> None:
+    """An error in every process unless all called a function with the same numbers and words."""
+    if jax.process_count() == 1:
+        return
+    said = hashlib.sha256()
+    leaves, form = jax.tree.flatten(given)
+    said.update(str(form).encode())
+    for leaf in leaves:
+        # The words for an array leave numbers out; its bytes do not.
+        is_array = isinstance(leaf, np.ndarray)
+        said.update((f"{leaf.dtype}{leaf.shape}" if is_array else repr(leaf)).encode())
+        said.update(leaf.tobytes() if is_array else b"")
+    if len({*all_of(said.hexdigest())}) > 1:
+        raise error(
+            f"the processes called {function} with different arguments: each must call with the same ones."
+        )
 
 
 def all_of(mine: Any) -> list[Any]:

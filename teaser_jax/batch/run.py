@@ -23,7 +23,7 @@ from teaser_jax.batch.groups import (
     read_stack,
     size_of,
 )
-from teaser_jax.batch.processes import all_of, local_mesh, share
+from teaser_jax.batch.processes import all_of, check_agreement, local_mesh, share
 from teaser_jax.batch.programs import programs, rooms, unit
 from teaser_jax.checks import whole_number
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
@@ -68,7 +68,8 @@ def solve_batch(
 
     Raises:
         ValueError: On arrays that do not belong together, with the number of the problem; under jit,
-            where ``jax.vmap(solve)`` is the function to use; on settings that make no sense.
+            where ``jax.vmap(solve)`` is the function to use; on settings that make no sense; where
+            processes call with different problems.
 
     Gradients: none; ``jax.vmap(solve)`` has them.
     """
@@ -79,8 +80,11 @@ def solve_batch(
         chunk_size = whole_number("chunk_size", chunk_size, 1, what="how many problems to send")
     if mesh is not None and not isinstance(mesh, Mesh):
         raise ValueError(f"mesh is of type {type(mesh).__name__}: expected a jax.sharding.Mesh.")
+    if mesh is not None and mesh.size == 0:
+        raise ValueError("mesh has no device: give one that has, or None for all there are.")
     if isinstance(problems, Problem):
         stack = read_stack(problems)
+        check_agreement("solve_batch", (stack, repr(settings)))
         count = len(stack.src)
         if count == 0:
             raise ValueError("solve_batch received a stack of no problem.")
@@ -90,11 +94,12 @@ def solve_batch(
         whole = _filled(parts, lambda chunks: _stacked(chunks, mine), mesh, settings, chunk_size, progress)
         found = [each for each in all_of(whole) if each is not None]
         return jax.tree.map(lambda *x: np.concatenate(x), *found)
-    if not isinstance(problems, Sequence):
+    if not isinstance(problems, Sequence) or isinstance(problems, str | bytes):
         raise ValueError(
             f"problems is of type {type(problems).__name__}: expected a list of Problem, or a stacked one."
         )
     listed = read_list(problems)
+    check_agreement("solve_batch", (listed, repr(settings)))
     mine = np.arange(len(listed))[share(len(listed), mesh)]
     local = [listed[k] for k in mine]
     parts = [(places, [local[k] for k in places]) for places in by_size(local).values()]

@@ -83,8 +83,14 @@ class Study:
         return [(value, range(count)) for value in (self.quick_values if quick else self.values)]
 
     def trial(self, seed: int, value: float, number: int, model: Model) -> Trial:
-        """One problem of a cell; the same for the same arguments, on every machine."""
-        problem = self.draw(seed_of(self.name, seed, value, number), value, model)
+        """One problem of a cell; the same for the same arguments, on every machine.
+
+        StudyError if the model has too few points for it, or no area.
+        """
+        try:
+            problem = self.draw(seed_of(self.name, seed, value, number), value, model)
+        except ValueError as error:
+            raise StudyError(f"{self.name} cannot draw from the model {model.name!r}: {error}") from error
         return Trial(value, number, problem, self.scale)
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 
+from teaser_jax.files import one_line
 from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.paper import write_report
 from teaser_jax.studies.peers import find_peers
@@ -67,6 +69,8 @@ def run(arguments: argparse.Namespace) -> int:
     model = TEAPOT if arguments.model == "procedural" else read_model(arguments.model)
     for name in names:
         if arguments.export is not None:
+            if arguments.method:
+                raise StudyError("--method chooses solvers: --export solves nothing")
             _export(name, model, arguments)
         else:
             _run(name, model, arguments)
@@ -75,16 +79,22 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _join(cluster: str) -> None:
     """Become one of several processes (``jax.distributed``), before any device is looked at."""
-    if not cluster:
-        jax.distributed.initialize()
-        return
-    address, *numbers = cluster.split(",")
-    if len(numbers) != 2 or not all(x.isdecimal() for x in numbers) or ":" not in address:
-        raise StudyError(f"--cluster is {cluster!r}: expected HOST:PORT,N,K as in 127.0.0.1:9876,2,0")
-    count, number = map(int, numbers)
-    if number >= count:
-        raise StudyError(f"--cluster is {cluster!r}: of {count} processes the last is number {count - 1}")
-    jax.distributed.initialize(address, count, number)
+    known: tuple[Any, ...] = ()
+    if cluster:
+        address, *numbers = cluster.split(",")
+        host, _, port = address.rpartition(":")
+        whole = all(x.isdecimal() for x in (port, *numbers))
+        if len(numbers) != 2 or not host or not whole or not 0 < int(port) < 2**16 or int(numbers[0]) < 1:
+            raise StudyError(f"--cluster is {cluster!r}: expected HOST:PORT,N,K as in 127.0.0.1:9876,2,0")
+        count, number = map(int, numbers)
+        if number >= count:
+            raise StudyError(f"--cluster is {cluster!r}: of {count} processes the last is number {count - 1}")
+        known = address, count, number
+    try:
+        jax.distributed.initialize(*known)
+    except (ValueError, RuntimeError) as error:
+        hint = "" if cluster else ": Slurm or Open MPI say nothing here, give HOST:PORT,N,K"
+        raise StudyError(f"--cluster: processes cannot be joined ({one_line(error)}){hint}") from error
 
 
 def _list() -> int:

@@ -26,17 +26,20 @@ def draw_study(place: str | Path) -> tuple[Path, Path]:
     """Draw ``figure.png`` (matplotlib) and ``figure.html`` (plotly, self-contained) beside the table.
 
     Raises:
-        FileError: As ``read_results``, and where the table has no row.
+        FileError: As ``read_results``; where the table has no row, or figures cannot be written.
         ImportError: Without the extra ``studies``.
     """
     place = Path(place)
     results = read_results(place)
     if not results.rows:
         raise FileError(f"{place / TABLE}: has no row yet: run the study first.")
-    with whole(place / PICTURE) as partial:
-        _picture(results).savefig(partial, dpi=110)
-    with whole(place / PAGE) as partial:
-        partial.write_text(_page(results), encoding="utf-8")
+    try:
+        with whole(place / PICTURE) as partial:
+            _picture(results).savefig(partial, dpi=110)
+        with whole(place / PAGE) as partial:
+            partial.write_text(_page(results), encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"{place}: figures cannot be written: {error.strerror or error}.") from error
     return place / PICTURE, place / PAGE
 
 

@@ -80,10 +80,10 @@ def read_results(place: str | Path) -> Results:
     """
     place = Path(place)
     try:
-        about = json.loads((place / ABOUT).read_text())
+        about = json.loads((place / ABOUT).read_text(encoding="utf-8"))
         study = studies()[about["study"]]
     except FileNotFoundError:
         raise FileError(f"{place}: no study there: run teaser-jax study first.") from None
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
         raise FileError(f"{place / ABOUT}: is no description of a study ({error}).") from error
     return Results(study, about, read_table(place / TABLE))

@@ -16,7 +16,7 @@ import jax
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from teaser_jax.batch.processes import all_of
+from teaser_jax.batch.processes import all_of, check_agreement
 from teaser_jax.files import FileError, one_line, whole
 from teaser_jax.studies.catalogue import Study, studies
 from teaser_jax.studies.figures import check_drawing, draw_study
@@ -80,6 +80,10 @@ def run_study(
     chosen = _chosen(study, methods, quick)
     cells = study.cells(runs, quick=quick)
     seed = check_seed(seed)
+    for value, _ in cells:
+        study.trial(seed, value, 0, model)  # says now, before anything is written, if there is none
+    asked = (name, runs, seed, model.name, model.shape, methods, quick)
+    check_agreement("run_study", asked, error=StudyError)
     place = Path(folder) / name
     with ExitStack() as stack:
         table, known, failure = None, set(), None
@@ -171,7 +175,9 @@ def _opened(place: Path, study: Study, seed: int, model: Model) -> Table:
     path = place / ABOUT
     try:
         place.mkdir(parents=True, exist_ok=True)
-        before: dict[str, Any] = json.loads(path.read_text()) if path.exists() else about | {"made_with": []}
+        before: dict[str, Any] = about | {"made_with": []}
+        if path.exists():
+            before = json.loads(path.read_text(encoding="utf-8"))
         for key in ("study", "model", "seed", "protocol"):
             if before.get(key) != about[key]:
                 raise FileError(
@@ -186,7 +192,7 @@ def _opened(place: Path, study: Study, seed: int, model: Model) -> Table:
         return table
     except OSError as error:
         raise FileError(f"{place}: cannot be written: {error.strerror or error}.") from error
-    except (json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
         raise FileError(f"{path}: is no description of a study ({error}): remove the folder.") from error
 
 

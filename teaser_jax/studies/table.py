@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 from collections.abc import Iterable, Sequence
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any
 
 from teaser_jax.files import FileError
 
@@ -28,7 +30,7 @@ class Table:
 
     def __init__(self, path: Path, columns: Sequence[str]):
         self.path, self.columns = path, tuple(columns)
-        self._file: BinaryIO = path.open("a+b")
+        self._file = path.open("a+b", buffering=0)
         try:
             _lock(self._file, path)
             self._mend()
@@ -53,20 +55,28 @@ class Table:
         """Cut what a killed program left of a row; write the header of a new file."""
         self._file.seek(0)
         content = self._file.read()
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) < len(content):
-            self._file.truncate(len(whole))
+        header = ",".join(self.columns).encode()
+        first, newline, _ = content.partition(b"\n")
+        # Somebody else's file is left as it is: also one of a single line, which might be half a header.
+        if first.rstrip(b"\r") != header if newline else not header.startswith(first):
+            raise FileError(f"{self.path}: holds other columns than this study writes: name another folder.")
+        whole = content.rfind(b"\n") + 1
+        if whole < len(content):
+            self._file.truncate(whole)
         if not whole:
             self._write([self.columns])
-        elif whole.splitlines()[0].decode(errors="replace") != ",".join(self.columns):
-            raise FileError(f"{self.path}: holds other columns than this study writes: name another folder.")
 
     def _write(self, lines: Sequence[Sequence[str]]) -> None:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(lines)
-        self._file.write(text.getvalue().encode())
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        left = memoryview(text.getvalue().encode())
+        try:
+            while left:
+                left = left[self._file.write(left) :]
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            reason = error.strerror or error
+            raise FileError(f"{self.path}: cannot be written: {reason}: the rows before are safe.") from error
 
 
 def read_table(path: str | Path) -> list[dict[str, Any]]:
@@ -75,7 +85,7 @@ def read_table(path: str | Path) -> list[dict[str, Any]]:
     A broken last line, as a running or killed study may leave it, is no row.
 
     Raises:
-        FileError: If there is no such file, or a row does not fit its header.
+        FileError: If there is no such file, or a row does not fit its header or says not which run it is.
     """
     path = Path(path)
     try:
@@ -93,11 +103,15 @@ def read_table(path: str | Path) -> list[dict[str, Any]]:
                 f"{path}: line {number} has {len(line)} fields, the header {len(header)}: mend or remove it."
             )
         try:
-            rows.append(
-                {c: x if c in TEXT else float(x) for c, x in zip(header, line, strict=True) if x != ""}
-            )
+            row = {c: x if c in TEXT else float(x) for c, x in zip(header, line, strict=True) if x != ""}
         except ValueError as error:
             raise FileError(f"{path}: line {number}: {error}: mend or remove it.") from None
+        value, trial = (float(row.get(column, math.nan)) for column in (*header[:1], "trial"))
+        if "method" not in row or not (math.isfinite(value) and trial >= 0 and trial % 1 == 0):
+            raise FileError(
+                f"{path}: line {number} does not say which cell, trial and method it is of: mend it."
+            )
+        rows.append(row)
     return rows
 
 
@@ -114,7 +128,7 @@ def written(number: float) -> str:
     return f"{number:.7g}"
 
 
-def _lock(file: BinaryIO, path: Path) -> None:
+def _lock(file: FileIO, path: Path) -> None:
     """One writer at a time, where the system can say so; the lock ends with the program, however it ends."""
     try:
         import fcntl

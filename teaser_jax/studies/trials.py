@@ -77,6 +77,8 @@ def read_model(path: str | Path) -> Model:
         ImportError: Without the extra ``studies``, for anything but ``.npy``.
     """
     path = Path(path)
+    if path.is_dir():
+        raise FileError(f"{path}: is a folder: name the file of a model in it.")
     if not path.is_file():
         raise FileError(f"{path}: no such file: give a model with triangles or points, or 'procedural'.")
     try:

@@ -86,6 +86,8 @@ def _teapot_slope(x: Points, step: float = 1e-5) -> Points:
 def _on_triangles(rng: np.random.Generator, n: int, mesh: Mesh) -> Points:
     a, b, c = np.moveaxis(np.asarray(mesh.vertices, float)[np.asarray(mesh.faces)], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    if not area.sum() > 0:
+        raise ValueError("the triangles of the model have no area.")
     face = rng.choice(len(area), n, p=area / area.sum())
     u, v = rng.random((2, n, 1))
     u, v = np.where(u + v > 1, (1 - u, 1 - v), (u, v))  # folds the square onto the triangle
