@@ -48,6 +48,16 @@ def answers(many):
     return tj.solve_batch(many)
 
 
+def test_one_that_goes_its_own_way_leaves_the_others_in_place():
+    """A full run, of which a single problem has a larger clique than the rest and needs more room."""
+    some = [problem(k, n=30, rate=0.0 if k == 1 else 0.6) for k in range(MOST)]
+    found = tj.solve_batch(some)
+    sizes = np.array([answer.clique_size for answer in found])
+    assert np.all((sizes > 16) == (np.arange(MOST) == 1))
+    for k in (0, 1, 2, MOST // 2, MOST - 1):
+        assert_same(found[k], tj.solve_batch([some[k]])[0])
+
+
 KINDS = {
     "known scale": {},
     "voted scale": dict(scale=None),

@@ -176,12 +176,30 @@ def _float32_will_do(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
     columns, numbers = sent.columns, sent.numbers
     if numbers.shape[-1] < 6:  # a voted scale keeps all digits
         return np.zeros(len(columns), bool)
-    usable = _usable(columns)
-
-    def extent(points: np.ndarray) -> np.ndarray:
-        return np.abs(np.where(usable[:, None], points, 0)).max(axis=(1, 2), initial=0)
-
     with np.errstate(invalid="ignore", over="ignore"):  # numbers that make no sense: a status will say so
-        reach = np.sqrt(3) * (numbers[:, 5] * extent(columns[:, :3]) + extent(columns[:, 3:6]))
-        bound = np.sqrt(numbers[:, 0]) * np.where(usable, columns[:, 6], np.inf).min(axis=1, initial=np.inf)
-        return float32_will_do(reach, bound)
+        # Rows that the mask hides can but widen the extent: most problems pass with them.
+        narrow = _reach_is_small(columns, numbers, _extents(columns), columns[:, 8] > 0)
+        rest = np.flatnonzero(~narrow)
+        if len(rest):
+            usable = _usable(columns[rest])
+            seen = np.where(usable[:, None], columns[rest], 0)
+            narrow[rest] = _reach_is_small(seen, numbers[rest], _extents(seen), usable)
+    return narrow
+
+
+def _extents(columns: Float[np.ndarray, "b 9 n"]) -> Float[np.ndarray, "b 2"]:
+    """The largest coordinate of each problem's two clouds; NaN where there is one."""
+    b, _, n = columns.shape
+    clouds = columns.reshape(b, 9 * n)[:, : 6 * n].reshape(b, 2, 3 * n)  # a view: no copy of the points
+    return np.maximum(clouds.max(axis=2), -clouds.min(axis=2))
+
+
+def _reach_is_small(
+    columns: Float[np.ndarray, "b 9 n"],
+    numbers: Float[np.ndarray, "b 6"],
+    extents: Float[np.ndarray, "b 2"],
+    usable: Bool[np.ndarray, "b n"],
+) -> Bool[np.ndarray, " b"]:
+    reach = np.sqrt(3) * (numbers[:, 5] * extents[:, 0] + extents[:, 1])
+    bound = np.sqrt(numbers[:, 0]) * np.where(usable, columns[:, 6], np.inf).min(axis=1, initial=np.inf)
+    return np.asarray(float32_will_do(reach, bound))

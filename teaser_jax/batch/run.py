@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Int
 from tqdm import tqdm
 
 from teaser_jax.batch.groups import (
+    Ready,
     Size,
     by_shape,
     by_size,
@@ -24,11 +25,12 @@ from teaser_jax.batch.groups import (
     size_of,
 )
 from teaser_jax.batch.processes import all_of, check_agreement, local_mesh, share
-from teaser_jax.batch.programs import programs, rooms, unit
+from teaser_jax.batch.programs import Programs, programs, rooms, unit
 from teaser_jax.checks import whole_number
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
 from teaser_jax.register import check_settings, with_origins, without_padding
-from teaser_jax.stages.clique import search_batch_on_host
+from teaser_jax.solve import Graph
+from teaser_jax.stages.clique import Clique, search_batch_on_host
 from teaser_jax.types import Problem, Settings, Solution
 
 WORKERS = 2  # threads: while one is on the host, the other keeps the devices busy
@@ -107,8 +109,9 @@ def solve_batch(
     return [each for some in all_of(answers) for each in some or ()]
 
 
-Part = tuple[Int[np.ndarray, " b"], "Problem | list[Problem]"]
-Chunk = tuple[Int[np.ndarray, " b"], Solution]
+Rows = Int[np.ndarray, " b"]
+Part = tuple[Rows, "Problem | list[Problem]"]
+Chunk = tuple[Rows, Solution]
 
 
 def _filled(
@@ -199,37 +202,87 @@ class Solver:
         return self._solve(pack_list(problems[rows], self.settings, size), size)
 
     def _solve(self, sent: PackedProblem, size: Size) -> Solution:
-        ready, settings = centred(sent), self.settings
-        sent = ready.sent
-        compiled = programs(choices_of(settings), self.mesh)
+        ready = centred(sent)
         with jax.enable_x64(True):  # of this thread only
-            graph, clique, proved = self._in_runs(compiled.before, ready.narrow, (sent,), size)
-            if settings.clique == "networkx" or (settings.clique == "exact" and not proved.all()):
-                clique = search_batch_on_host(
-                    graph.edge_bits, sent.mask, *clique, method=settings.clique,
-                    nodes=settings.clique_nodes, seconds=settings.clique_seconds,
-                )  # fmt: skip
-            room = rooms(size, settings, np.sum(clique.members, axis=1))
-            solution = unpack_solution(self._in_runs(compiled.after, room, (sent, graph, clique), size))
+            runs, clique = self._until_cliques(ready, size)
+            solution = unpack_solution(self._since_cliques(ready.sent, runs, clique, size))
         return solution if ready.origins is None else with_origins(solution, *ready.origins)
 
-    def _in_runs(self, program: Any, choice: np.ndarray, arrays: tuple[Any, ...], size: Size) -> Any:
-        """What a program makes of each problem, in numpy; those that make the same choice share runs."""
-        length, sharding = self.run_length(size), programs(choices_of(self.settings), self.mesh).sharding
-        launched = []
-        for each in np.unique(choice):
-            alike = np.flatnonzero(choice == each)
-            for k in range(0, len(alike), length):
-                some = alike[k : k + length]
-                sent = jax.device_put(_filled_up(arrays, some, length), sharding)
-                launched.append((some, program(*sent, each.item())))
-        order = np.concatenate([some for some, _ in launched])
-        parts = [_fetched(answer, len(some)) for some, answer in launched]
-        whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)  # may be written to, as numpy's may
-        if np.all(order[:-1] < order[1:]):
-            return whole
-        back = np.argsort(order)
-        return jax.tree.map(lambda x: x[back], whole)
+    def _until_cliques(self, ready: Ready, size: Size) -> tuple[list[Run], Clique]:
+        """The first program on all problems, and the host's search where it has no proof."""
+        length, before = self.run_length(size), self.programs.before
+        runs = []
+        for rows, narrow in _in_runs(ready.narrow, length):
+            there = self._put(_problems(ready.sent, rows, length))
+            runs.append(Run(rows, there, *before(there, narrow)))
+        searched = [self._searched(run, ready.sent) for run in runs]
+        runs = [run for run, _ in searched]
+        return runs, _in_order([run.rows for run in runs], [clique for _, clique in searched])
+
+    def _searched(self, run: Run, sent: PackedProblem) -> tuple[Run, Clique]:
+        """The cliques of a run on the devices, and in numpy."""
+        count, settings = len(run.rows), self.settings
+        clique, proved = _fetched((run.clique, run.proved), count)
+        if settings.clique != "networkx" and (settings.clique != "exact" or proved.all()):
+            return run, clique
+        clique = search_batch_on_host(
+            _fetched(run.graph.edge_bits, count), sent.mask[run.rows], *clique, method=settings.clique,
+            nodes=settings.clique_nodes, seconds=settings.clique_seconds,
+        )  # fmt: skip
+        everywhere = _filled_up(clique, np.arange(count), len(run.sent.columns))
+        return run._replace(clique=self._put(everywhere)), clique
+
+    def _since_cliques(self, sent: PackedProblem, runs: list[Run], clique: Clique, size: Size) -> Any:
+        """The second program on all problems, in numpy."""
+        length, after = self.run_length(size), self.programs.after
+        graph, answers = None, []
+        chosen = _in_runs(rooms(size, self.settings, np.sum(clique.members, axis=1)), length)
+        for rows, room in chosen:
+            there = next((run[1:4] for run in runs if np.array_equal(run.rows, rows)), None)
+            if there is None:  # not as they went through the first: through the host
+                if graph is None:
+                    graphs = [_fetched(run.graph, len(run.rows)) for run in runs]
+                    graph = _in_order([run.rows for run in runs], graphs)
+                company = _filled_up((graph, clique), rows, length)
+                there = self._put((_problems(sent, rows, length), *company))
+            answers.append(after(*there, room))
+        places = [rows for rows, _ in chosen]
+        return _in_order(places, [_fetched(x, len(k)) for k, x in zip(places, answers, strict=True)])
+
+    @property
+    def programs(self) -> Programs:
+        """Compiled once for these settings and this mesh."""
+        return programs(choices_of(self.settings), self.mesh)
+
+    def _put(self, arrays: Any) -> Any:
+        """Onto the devices, a share each."""
+        return jax.device_put(arrays, self.programs.sharding)
+
+
+class Run(NamedTuple):
+    """Problems that went through the first program side by side, and what the devices hold of them."""
+
+    rows: Rows  # in the chunk
+    sent: PackedProblem
+    graph: Graph
+    clique: Clique
+    proved: Any
+
+
+def _in_runs(choice: np.ndarray, length: int) -> list[tuple[Rows, Any]]:
+    """Rows for each run, and their choice: those that make the same one share runs."""
+    alike = [(np.flatnonzero(choice == each), each.item()) for each in np.unique(choice)]
+    return [(rows[k : k + length], each) for rows, each in alike for k in range(0, len(rows), length)]
+
+
+def _in_order(rows: Sequence[Rows], parts: Sequence[Any]) -> Any:
+    """One stack of what runs have found, in the order of the chunk."""
+    order = np.concatenate(rows)
+    whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)  # may be written to, as numpy's may
+    if np.all(order[:-1] < order[1:]):
+        return whole
+    back = np.argsort(order)
+    return jax.tree.map(lambda x: x[back], whole)
 
 
 def _fetched(arrays: Any, count: int) -> Any:
@@ -237,11 +290,17 @@ def _fetched(arrays: Any, count: int) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[:count], arrays)
 
 
-def _filled_up(arrays: tuple[Any, ...], some: Int[np.ndarray, " k"], length: int) -> tuple[Any, ...]:
-    """These rows of problems, graphs and cliques; what fills the run repeats the first, and is masked."""
-    fill = np.append(some, np.repeat(some[:1], length - len(some)))
-    if some[-1] - some[0] == length - 1:  # all in one piece: nothing is copied
-        return jax.tree.map(lambda x: x[some[0] : some[0] + length], arrays)
-    sent, *rest = jax.tree.map(lambda x: x[fill], arrays)
-    sent.columns[len(some) :, 8] = 0
-    return (sent, *rest)
+def _problems(sent: PackedProblem, rows: Rows, length: int) -> PackedProblem:
+    """These problems, and in what fills the run a repeated one whose rows are masked."""
+    filled = _filled_up(sent, rows, length)
+    if len(rows) < length:
+        filled.columns[len(rows) :, 8] = 0
+    return filled
+
+
+def _filled_up(arrays: Any, rows: Rows, length: int) -> Any:
+    """These rows; what fills the run repeats the first."""
+    if len(rows) == length == rows[-1] - rows[0] + 1:  # all in one piece: nothing is copied
+        return jax.tree.map(lambda x: x[rows[0] : rows[0] + length], arrays)
+    fill = np.append(rows, np.repeat(rows[:1], length - len(rows)))
+    return jax.tree.map(lambda x: x[fill], arrays)
