@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from benchmarks import (
+    accelerator,
     accuracy,
     baseline,
     batch,
@@ -33,6 +34,7 @@ BENCHMARKS = {
     "growth": growth,
     "certificate": certificate,
     "batch": batch,
+    "accelerator": accelerator,
     "gradients": gradients,
     "learning": learning,
 }
@@ -73,6 +75,9 @@ def main() -> None:
     for name in options.only:
         module = BENCHMARKS[name]
         rows = module.run(quick=options.quick)
+        if not rows:
+            print(f"{name}: nothing to measure on this machine.", flush=True)
+            continue
         print(module.report(rows), flush=True)
         if options.quick:
             continue

@@ -1,4 +1,4 @@
-"""How the programs of the host's front doors are compiled: for the CPU's sake, with no global setting."""
+"""How the programs of the host's front doors are compiled, with no global setting."""
 
 from __future__ import annotations
 
@@ -12,3 +12,6 @@ WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
 # clique and of certificates is as fast; the consistency graph would be three times slower. Newer JAX may
 # not have them.
 OLDER_EMITTERS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+# On GPUs XLA picks kernels by a race, which takes a third of the compile time, wins nothing for products as
+# small as ours, and may end differently, in its last bits too, in the next process.
+UNTIMED_KERNELS = {"xla_gpu_autotune_level": 0}

@@ -13,10 +13,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 import teaser_jax as tj
 from teaser_jax.batch.groups import Size
 from teaser_jax.batch.programs import MOST, NO_ROOM, rooms
+from teaser_jax.batch.run import Solver
 from teaser_jax.synthetic import random_problem
 
 HERE = Path(__file__).parent
@@ -56,6 +58,24 @@ def test_one_that_goes_its_own_way_leaves_the_others_in_place():
     assert np.all((sizes > 16) == (np.arange(MOST) == 1))
     for k in (0, 1, 2, MOST // 2, MOST - 1):
         assert_same(found[k], tj.solve_batch([some[k]])[0])
+
+
+def test_waiting_for_a_device_changes_nothing(many, answers, monkeypatch):
+    """On accelerators threads take turns; here the host is asked to."""
+    monkeypatch.setattr(Solver, "on_cpu", property(lambda self: False))
+    for one, other in zip(tj.solve_batch(many), answers, strict=True):
+        assert_same(one, other)
+
+
+@pytest.mark.skipif(jax.default_backend() == "cpu", reason="no accelerator")
+def test_an_accelerator_finds_what_the_processor_finds(many):
+    there, here = (Mesh(np.array(jax.devices(kind)[:1]), ("x",)) for kind in (jax.default_backend(), "cpu"))
+    found = [tj.solve_batch(many, mesh=mesh) for mesh in (there, here)]
+    for one, other in zip(*found, strict=True):
+        for name in SETS:
+            np.testing.assert_array_equal(getattr(one.selection, name), getattr(other.selection, name))
+        for x, y in zip(jax.tree.leaves(one.pose), jax.tree.leaves(other.pose), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-12)
 
 
 KINDS = {

@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Int
 
 from teaser_jax.batch.groups import Size
-from teaser_jax.compilation import WHOLE_SUMS, WIDE_VECTORS
+from teaser_jax.compilation import UNTIMED_KERNELS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.packing import PackedProblem
 from teaser_jax.register import since_clique, until_clique
 from teaser_jax.types import Settings
@@ -62,7 +62,7 @@ def programs(choices: Settings, mesh: Mesh) -> Programs:
     """Both programs on a mesh of one axis; no device waits for another."""
     across = PartitionSpec(AXIS)
     sharding = NamedSharding(mesh, across)
-    on_cpu = mesh.devices.flat[0].platform == "cpu"
+    on_cpu, on_gpu = (mesh.devices.flat[0].platform == name for name in ("cpu", "gpu"))
 
     def sharded(one: Callable[..., Any], *args: Any) -> Any:
         # The loops of one shard end when its own problems are done: sharded arrays under plain jit would wait
@@ -78,7 +78,7 @@ def programs(choices: Settings, mesh: Mesh) -> Programs:
     def after(sent: PackedProblem, graph: Any, clique: Any, room: int) -> Any:
         return sharded(lambda s, g, c: since_clique(s, g, c, choices, room or None), sent, graph, clique)
 
-    options = WHOLE_SUMS | WIDE_VECTORS if on_cpu else {}
+    options = WHOLE_SUMS | WIDE_VECTORS if on_cpu else UNTIMED_KERNELS if on_gpu else {}
     return Programs(
         jax.jit(before, static_argnames="narrow", compiler_options=options),
         jax.jit(after, static_argnames="room", compiler_options=options),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any, NamedTuple
 
 import jax
@@ -33,8 +35,10 @@ from teaser_jax.solve import Graph
 from teaser_jax.stages.clique import Clique, search_batch_on_host
 from teaser_jax.types import Problem, Settings, Solution
 
-WORKERS = 2  # threads: while one is on the host, the other keeps the devices busy
-RUNS_A_CHUNK = 4
+# Threads: while some are on the host, others keep the devices busy. A CPU solves one run with little more
+# than one core, and packing for an accelerator takes longer than solving there.
+WORKERS = max(2, min(8, os.cpu_count() or 1))
+RUNS_A_CHUNK = 4  # of the small runs of a CPU
 
 
 def solve_batch(
@@ -90,8 +94,8 @@ def solve_batch(
         count = len(stack.src)
         if count == 0:
             raise ValueError("solve_batch received a stack of no problem.")
+        chosen = jax.tree.map(lambda x: x[share(count, mesh)], stack)
         mine = np.arange(count)[share(count, mesh)]
-        chosen = jax.tree.map(lambda x: x[mine], stack)
         parts = [(mine, chosen)] if len(mine) else []
         whole = _filled(parts, lambda chunks: _stacked(chunks, mine), mesh, settings, chunk_size, progress)
         found = [each for each in all_of(whole) if each is not None]
@@ -179,17 +183,22 @@ class Solver:
 
     mesh: Mesh
     settings: Settings
+    turn: Lock = field(default_factory=Lock)  # of a thread to use an accelerator
 
     def run_length(self, size: Size) -> int:
         """Problems in one run of the programs."""
         return unit(size, self.mesh.devices.flat[0]) * self.mesh.size
 
+    @property
+    def on_cpu(self) -> bool:
+        """Whether host and devices are the same."""
+        return self.mesh.devices.flat[0].platform == "cpu"
+
     def length(self, problems: Problem | list[Problem], chunk_size: int | None, count: int) -> int:
         """Problems in a chunk, of so many: whole runs, and by default something for every thread."""
         run = self.run_length(size_of(problems if isinstance(problems, Problem) else problems[0]))
-        runs = (
-            min(RUNS_A_CHUNK, -(-count // (WORKERS * run))) if chunk_size is None else -(-chunk_size // run)
-        )
+        most = RUNS_A_CHUNK if self.on_cpu else 1
+        runs = min(most, -(-count // (WORKERS * run))) if chunk_size is None else -(-chunk_size // run)
         return run * runs
 
     def solve(self, problems: Problem | list[Problem], rows: slice) -> Solution:
@@ -214,7 +223,7 @@ class Solver:
         runs = []
         for rows, narrow in _in_runs(ready.narrow, length):
             there = self._put(_problems(ready.sent, rows, length))
-            runs.append(Run(rows, there, *before(there, narrow)))
+            runs.append(Run(rows, there, *self._run(before, there, narrow)))
         searched = [self._searched(run, ready.sent) for run in runs]
         runs = [run for run, _ in searched]
         return runs, _in_order([run.rows for run in runs], [clique for _, clique in searched])
@@ -245,7 +254,7 @@ class Solver:
                     graph = _in_order([run.rows for run in runs], graphs)
                 company = _filled_up((graph, clique), rows, length)
                 there = self._put((_problems(sent, rows, length), *company))
-            answers.append(after(*there, room))
+            answers.append(self._run(after, *there, room))
         places = [rows for rows, _ in chosen]
         return _in_order(places, [_fetched(x, len(k)) for k, x in zip(places, answers, strict=True)])
 
@@ -254,9 +263,20 @@ class Solver:
         """Compiled once for these settings and this mesh."""
         return programs(choices_of(self.settings), self.mesh)
 
+    # Threads that leave the order of transfers and programs on a GPU to JAX (0.11) now and then, once in some
+    # million problems, had a program start before the last of its problems were there. So they wait.
+
     def _put(self, arrays: Any) -> Any:
         """Onto the devices, a share each."""
-        return jax.device_put(arrays, self.programs.sharding)
+        there = jax.device_put(arrays, self.programs.sharding)
+        return there if self.on_cpu else jax.block_until_ready(there)
+
+    def _run(self, program: Callable[..., Any], *args: Any) -> Any:
+        """A program, on accelerators alone and to its end, which takes no longer: others pack meanwhile."""
+        if self.on_cpu:
+            return program(*args)
+        with self.turn:
+            return jax.block_until_ready(program(*args))
 
 
 class Run(NamedTuple):

@@ -189,15 +189,22 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
     src, dst, mask = problem.src, problem.dst, problem.mask
     if src.shape[0] == 0:
         return jnp.zeros(len(TURNS), jnp.int32)
-    # Component by component: pairs of turns and matches are met in one pass and never stored.
     which = jnp.arange(len(TURNS), dtype=jnp.int32) % jnp.maximum(jnp.sum(inliers, dtype=jnp.int32), 1)
     pivots = bits.listed(inliers)[which]
-    a, b, entries = src[pivots], dst[pivots], jnp.asarray(TURNS, src.dtype).T  # (k, j) of all turns in a row
+    src, dst = src - src[pivots[0]], dst - dst[pivots[0]]  # no digits are lost far from the origin
+    a, b, entries = src[pivots].T, dst[pivots].T, jnp.asarray(TURNS, src.dtype)
+    # Component by component: pairs of turns and matches are met in one pass and never stored. The barrier
+    # keeps what belongs to a turn alone out of that pass, where a GPU would find it anew for every match.
+    turned = [
+        [sum(entries[:, i, k] * pose.rotation[k, j] for k in range(3)) for j in range(3)] for i in range(3)
+    ]
+    by_turn = pose.scale * jnp.stack([jnp.stack(row) for row in turned])
+    offset = b - jnp.sum(by_turn * a, axis=1)
+    by_turn, offset = lax.optimization_barrier((by_turn, offset))
     residual2 = jnp.zeros((), src.dtype)
     for i in range(3):
-        turned = [sum(entries[k, i] * pose.rotation[k, j] for k in range(3)) for j in range(3)]
-        moved = sum(turned[j][:, None] * (src[:, j] - a[:, j, None]) for j in range(3))
-        residual2 += (dst[:, i] - b[:, i, None] - pose.scale * moved) ** 2
+        moved = sum(by_turn[i, j][:, None] * src[:, j] for j in range(3))
+        residual2 += (dst[:, i] - offset[i][:, None] - moved) ** 2
     agree = (residual2 <= problem.cbar2 * problem.noise_bound**2) & mask
     return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
 
