@@ -191,20 +191,21 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
         return jnp.zeros(len(TURNS), jnp.int32)
     which = jnp.arange(len(TURNS), dtype=jnp.int32) % jnp.maximum(jnp.sum(inliers, dtype=jnp.int32), 1)
     pivots = bits.listed(inliers)[which]
-    src, dst = src - src[pivots[0]], dst - dst[pivots[0]]  # no digits are lost far from the origin
-    a, b, entries = src[pivots].T, dst[pivots].T, jnp.asarray(TURNS, src.dtype)
+    # From the first pivot, so that no digits are lost far from the origin.
+    x, y = (points.T - points[pivots[0]][:, None] for points in (src, dst))
+    a, b, entries = x[:, pivots], y[:, pivots], jnp.asarray(TURNS, src.dtype)
     # Component by component: pairs of turns and matches are met in one pass and never stored. The barrier
     # keeps what belongs to a turn alone out of that pass, where a GPU would find it anew for every match.
     turned = [
-        [sum(entries[:, i, k] * pose.rotation[k, j] for k in range(3)) for j in range(3)] for i in range(3)
+        sum(entries[:, i, k] * pose.rotation[k, j] for k in range(3)) for i in range(3) for j in range(3)
     ]
-    by_turn = pose.scale * jnp.stack([jnp.stack(row) for row in turned])
-    offset = b - jnp.sum(by_turn * a, axis=1)
+    by_turn = pose.scale * jnp.stack(turned).reshape(3, 3, -1)
+    offset = jnp.stack([b[i] - sum(by_turn[i, j] * a[j] for j in range(3)) for i in range(3)])
     by_turn, offset = lax.optimization_barrier((by_turn, offset))
     residual2 = jnp.zeros((), src.dtype)
     for i in range(3):
-        moved = sum(by_turn[i, j][:, None] * src[:, j] for j in range(3))
-        residual2 += (dst[:, i] - offset[i][:, None] - moved) ** 2
+        moved = sum(by_turn[i, j][:, None] * x[j] for j in range(3))
+        residual2 += (y[i] - offset[i][:, None] - moved) ** 2
     agree = (residual2 <= problem.cbar2 * problem.noise_bound**2) & mask
     return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
 
