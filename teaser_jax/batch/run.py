@@ -94,8 +94,8 @@ def solve_batch(
         count = len(stack.src)
         if count == 0:
             raise ValueError("solve_batch received a stack of no problem.")
-        chosen = jax.tree.map(lambda x: x[share(count, mesh)], stack)
-        mine = np.arange(count)[share(count, mesh)]
+        part = share(count, mesh)
+        mine, chosen = np.arange(count)[part], jax.tree.map(lambda x: x[part], stack)
         parts = [(mine, chosen)] if len(mine) else []
         whole = _filled(parts, lambda chunks: _stacked(chunks, mine), mesh, settings, chunk_size, progress)
         found = [each for each in all_of(whole) if each is not None]
