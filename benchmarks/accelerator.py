@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
-from benchmarks.batch import right, seconds
+from benchmarks.batch import one_by_one, right, seconds
 from benchmarks.problems import protocol
 
 # Matches, wrong matches, problems drawn, times that each is repeated, wanted [problems/s].
@@ -62,14 +62,13 @@ def cell(n: int, rate: float, count: int, times: int, wanted: int | None, rounds
     first = jax.tree.map(lambda x: x[0], repeated)
     sets = [jax.tree.leaves(s.selection) for s in (first, on_cpu)]
     poses = [jax.tree.leaves(s.pose) for s in (first, on_cpu)]
-    each = [jax.tree.map(lambda x, k=k: x[k], first.pose) for k in range(count)]
     return {
         "cell": cases[0].cell,
         "batch": count * times,
         "wanted": wanted,
         "cold": cold,
         "rates": {name: sizes[name] / taken[name] for name in taken},
-        "right": right(cases, each),
+        "right": right(cases, one_by_one(first.pose)),
         "same_bits": all(np.all(x == x[:1]) for x in jax.tree.leaves(repeated)),
         "other_sets": int(
             sum(any(np.any(x[k] != y[k]) for x, y in zip(*sets, strict=True)) for k in range(count))

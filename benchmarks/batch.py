@@ -39,6 +39,11 @@ def right(cases: list[Case], poses: list[tj.Pose]) -> float:
     return float(np.mean([case.is_right(pose) for case, pose in zip(cases, poses, strict=True)]))
 
 
+def one_by_one(poses: tj.Pose) -> list[tj.Pose]:
+    """The poses of a stack."""
+    return [jax.tree.map(lambda x, k=k: x[k], poses) for k in range(len(poses.scale))]
+
+
 def by_peer(cases: list[Case]) -> list[tj.Pose]:
     """A share of the problems, in one process."""
     return [PEERS[PEER].solve(case) for case in cases]
@@ -73,8 +78,8 @@ def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, pool:
     taken = seconds(works, rounds)
     sizes = {"loop": len(some)}
     row["rates"] = {name: sizes.get(name, count) / taken[name] for name in works}
-    each = [jax.tree.map(lambda x, k=k: x[k], batch.pose) for k in range(count)]
-    row["right"], row["right_loop"] = right(cases, each), right(some, [a.pose for a in alone])
+    row["right"] = right(cases, one_by_one(batch.pose))
+    row["right_loop"] = right(some, [a.pose for a in alone])
     row["proved"] = float(np.mean(batch.clique_is_maximum))
     row["proved_on_device"] = float(np.mean(proved_on_device(stack)))
     return row

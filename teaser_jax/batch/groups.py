@@ -181,8 +181,9 @@ def _float32_will_do(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
         narrow = _reach_is_small(columns, numbers, _extents(columns), columns[:, 8] > 0)
         rest = np.flatnonzero(~narrow)
         if len(rest):
-            usable = _usable(columns[rest])
-            seen = np.where(usable[:, None], columns[rest], 0)
+            wide = columns[rest]
+            usable = _usable(wide)
+            seen = np.where(usable[:, None], wide, 0)
             narrow[rest] = _reach_is_small(seen, numbers[rest], _extents(seen), usable)
     return narrow
 

@@ -34,9 +34,14 @@ class Programs(NamedTuple):
     sharding: NamedSharding
 
 
-def unit(size: Size, device: Any) -> int:
+def platform(mesh: Mesh) -> str:
+    """What kind of devices a mesh has: "cpu", "gpu", ..."""
+    return mesh.devices.flat[0].platform
+
+
+def unit(size: Size, kind: str) -> int:
     """How many problems of a size one device solves in one run: the same whatever the chunks."""
-    if device.platform == "cpu":
+    if kind == "cpu":
         beside = min(MOST, ROWS // size.n)
         return beside if size.n < ALONE else max(1, min(MOST_IN_TURN, ROWS_IN_TURN // size.n))
     numbers = size.n * (size.n // 2 if size.n <= ALONE else size.n // 8) * 8
@@ -62,7 +67,7 @@ def programs(choices: Settings, mesh: Mesh) -> Programs:
     """Both programs on a mesh of one axis; no device waits for another."""
     across = PartitionSpec(AXIS)
     sharding = NamedSharding(mesh, across)
-    on_cpu, on_gpu = (mesh.devices.flat[0].platform == name for name in ("cpu", "gpu"))
+    on_cpu, on_gpu = (platform(mesh) == kind for kind in ("cpu", "gpu"))
 
     def sharded(one: Callable[..., Any], *args: Any) -> Any:
         # The loops of one shard end when its own problems are done: sharded arrays under plain jit would wait

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from teaser_jax.batch.groups import (
     size_of,
 )
 from teaser_jax.batch.processes import all_of, check_agreement, local_mesh, share
-from teaser_jax.batch.programs import Programs, programs, rooms, unit
+from teaser_jax.batch.programs import Programs, platform, programs, rooms, unit
 from teaser_jax.checks import whole_number
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
 from teaser_jax.register import check_settings, with_origins, without_padding
@@ -187,12 +188,12 @@ class Solver:
 
     def run_length(self, size: Size) -> int:
         """Problems in one run of the programs."""
-        return unit(size, self.mesh.devices.flat[0]) * self.mesh.size
+        return unit(size, platform(self.mesh)) * self.mesh.size
 
     @property
     def on_cpu(self) -> bool:
         """Whether host and devices are the same."""
-        return self.mesh.devices.flat[0].platform == "cpu"
+        return platform(self.mesh) == "cpu"
 
     def length(self, problems: Problem | list[Problem], chunk_size: int | None, count: int) -> int:
         """Problems in a chunk, of so many: whole runs, and by default something for every thread."""
@@ -219,7 +220,7 @@ class Solver:
 
     def _until_cliques(self, ready: Ready, size: Size) -> tuple[list[Run], Clique]:
         """The first program on all problems, and the host's search where it has no proof."""
-        length, before = self.run_length(size), self.programs.before
+        length, before = self.run_length(size), self.compiled.before
         runs = []
         for rows, narrow in _in_runs(ready.narrow, length):
             there = self._put(_problems(ready.sent, rows, length))
@@ -243,7 +244,7 @@ class Solver:
 
     def _since_cliques(self, sent: PackedProblem, runs: list[Run], clique: Clique, size: Size) -> Any:
         """The second program on all problems, in numpy."""
-        length, after = self.run_length(size), self.programs.after
+        length, after = self.run_length(size), self.compiled.after
         graph, answers = None, []
         chosen = _in_runs(rooms(size, self.settings, np.sum(clique.members, axis=1)), length)
         for rows, room in chosen:
@@ -258,9 +259,9 @@ class Solver:
         places = [rows for rows, _ in chosen]
         return _in_order(places, [_fetched(x, len(k)) for k, x in zip(places, answers, strict=True)])
 
-    @property
-    def programs(self) -> Programs:
-        """Compiled once for these settings and this mesh."""
+    @cached_property
+    def compiled(self) -> Programs:
+        """The programs for these settings on this mesh."""
         return programs(choices_of(self.settings), self.mesh)
 
     # Threads that leave the order of transfers and programs on a GPU to JAX (0.11) now and then, once in some
@@ -268,7 +269,7 @@ class Solver:
 
     def _put(self, arrays: Any) -> Any:
         """Onto the devices, a share each."""
-        there = jax.device_put(arrays, self.programs.sharding)
+        there = jax.device_put(arrays, self.compiled.sharding)
         return there if self.on_cpu else jax.block_until_ready(there)
 
     def _run(self, program: Callable[..., Any], *args: Any) -> Any:
