@@ -1,28 +1,79 @@
-"""Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX."""
+"""Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX.
 
-from teaser_jax import files, learn, metrics, plots, so3, studies, synthetic
-from teaser_jax.batch.run import solve_batch
-from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
-from teaser_jax.certify.error_bounds import ErrorBounds, error_bounds
-from teaser_jax.certify.pose import certify
-from teaser_jax.certify.rotation import certify_rotation
-from teaser_jax.certify.verify import verify
-from teaser_jax.problem import make_problem, stack_problems
-from teaser_jax.profile import Profile, profile
-from teaser_jax.register import Registration, host_problem, register, warmup
-from teaser_jax.soft import SoftSolution, soft_solve
-from teaser_jax.solve import refit, select, solve
-from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
-from teaser_jax.uncertainty import Uncertainty, covariance, pose_difference
-from teaser_jax.wahba import RotationSolution, solve_rotation
+``register`` is the door for one pair on the host; ``solve`` is the same under jit, vmap and grad; ``solve_batch``
+takes thousands. Everything loads when it is first used.
+"""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
+if TYPE_CHECKING:  # for editors and type checkers: at run time the table below is asked
+    from teaser_jax import files, learn, metrics, plots, settings, so3, studies, synthetic
+    from teaser_jax.certify.certificate import Certificate
+    from teaser_jax.certify.error_bounds import error_bounds
+    from teaser_jax.certify.pose import certify
+    from teaser_jax.certify.rotation import certify_rotation
+    from teaser_jax.certify.verify import verify
+    from teaser_jax.pose import Pose
+    from teaser_jax.problem import Problem, host_problem, make_problem, stack_problems
+    from teaser_jax.profile import profile
+    from teaser_jax.refit import refit
+    from teaser_jax.register import Registration, register, warmup
+    from teaser_jax.settings import Settings
+    from teaser_jax.soft import soft_solve
+    from teaser_jax.solution import Selection, Solution, Status
+    from teaser_jax.solve import select, solve
+    from teaser_jax.solve_batch import solve_batch
+    from teaser_jax.solve_rotation import solve_rotation
+    from teaser_jax.uncertainty import covariance
+
+# The module that each name of the front page lives in.
+_HOMES = {
+    "register": "register", "Registration": "register", "warmup": "register", "profile": "profile",
+    "solve": "solve", "select": "solve", "refit": "refit", "soft_solve": "soft",
+    "solve_batch": "solve_batch", "solve_rotation": "solve_rotation",
+    "make_problem": "problem", "host_problem": "problem", "stack_problems": "problem", "Problem": "problem",
+    "Pose": "pose", "Settings": "settings", "Status": "solution", "Selection": "solution",
+    "Solution": "solution", "certify": "certify.pose", "certify_rotation": "certify.rotation",
+    "verify": "certify.verify", "Certificate": "certify.certificate",
+    "error_bounds": "certify.error_bounds", "covariance": "uncertainty",
+}  # fmt: skip
+_MODULES = ("files", "learn", "metrics", "plots", "settings", "so3", "studies", "synthetic")
+
 __all__ = [
-    "Certificate", "CertificateStatus", "CertifiedBy", "ErrorBounds", "Pose", "Problem", "Profile",
-    "Registration", "RotationSolution", "Selection", "Settings", "SoftSolution", "Solution", "Status",
-    "Uncertainty", "certify", "certify_rotation", "covariance", "error_bounds", "files", "host_problem",
-    "learn", "make_problem", "metrics", "plots", "pose_difference", "profile", "refit", "register", "select",
-    "so3", "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic",
+    "Certificate", "Pose", "Problem", "Registration", "Selection", "Settings", "Solution", "Status",
+    "certify", "certify_rotation", "covariance", "error_bounds", "files", "host_problem", "learn",
+    "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "settings", "so3",
+    "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic",
     "verify", "warmup",
 ]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"teaser_jax.{name}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'teaser_jax' has no attribute {name!r}")
+    found = getattr(import_module(f"teaser_jax.{_HOMES[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _FrontPage(ModuleType):
+    """A package whose functions are not hidden by the modules of the same name that they live in."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Python binds each module that loads to its package: `teaser_jax.solve` must stay the function.
+        if not (name in _HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _FrontPage

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from teaser_jax import so3
-from teaser_jax.types import Pose
+from teaser_jax.ground.arrays import namespace
+from teaser_jax.pose import Pose
 
 
 class PoseErrors(NamedTuple):
@@ -38,7 +39,7 @@ def rotation_error(estimate: Pose, truth: Pose) -> Any:
 
 def translation_error(estimate: Pose, truth: Pose) -> Any:
     """Distance between the two translations [length]."""
-    xp = so3.namespace(estimate.translation, truth.translation)
+    xp = namespace(estimate.translation, truth.translation)
     return xp.sqrt(xp.sum((estimate.translation - truth.translation) ** 2, axis=-1))
 
 

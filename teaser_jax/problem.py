@@ -1,21 +1,43 @@
-"""Problems from arrays: validation, defaults, padding and stacking.
-
-Validation lives here and not in the records: JAX rebuilds records all the time, also from
-placeholders that are no arrays.
-"""
+"""The problem: matched points and what is known of them. It is made, stacked, padded and cleaned here."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from teaser_jax.types import Problem
+from teaser_jax import reading
+from teaser_jax.ground.arrays import AnyArray, is_traced
 
-MOST_CONFIDENCE = 1e9
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Problem:
+    """Matched points and what is known about them. Built by ``make_problem``.
+
+    Attributes:
+        src, dst: Matched points, row i with row i [length unit of the user].
+        noise_bound: beta_i, the largest error of a right match [same unit].
+        cbar2: Truncation c-bar squared of the cost (6) [-].
+        mask: Rows to use; padding is masked.
+        confidence: Weight of each match in the final fit, w_i = confidence_i / beta_i^2 [-].
+        scale: Known scale [-], or None: estimate it. None is structure, so static under jit.
+        pairs: Index pairs whose TIMs are used, or None for all. A pair (i, i) is padding.
+    """
+
+    src: Float[AnyArray, "n 3"]
+    dst: Float[AnyArray, "n 3"]
+    noise_bound: Float[AnyArray, " n"]
+    cbar2: Float[AnyArray, ""]
+    mask: Bool[AnyArray, " n"]
+    confidence: Float[AnyArray, " n"]
+    scale: Float[AnyArray, ""] | None = None
+    pairs: Int[AnyArray, "m 2"] | None = None
 
 
 def make_problem(
@@ -59,6 +81,22 @@ def make_problem(
     return jax.tree.map(jnp.asarray, read)
 
 
+def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
+    """A problem in float64 numpy, from anything that can be read on the host: for ``solve_batch``.
+
+    Args:
+        src, dst: (n, 3) matched points, row i with row i [length].
+        known: The other arguments of ``make_problem``: ``noise_bound`` [length], ``scale``, ``cbar2``,
+            ``mask``, ``confidence``, ``pairs``.
+
+    Raises:
+        ValueError: As ``make_problem``; inside jit, where ``make_problem`` is the function to use.
+    """
+    if is_traced(src, dst, known):
+        raise ValueError("host_problem reads numbers on the host: inside jit use make_problem.")
+    return read_problem(src, dst, dtype=np.dtype(np.float64), **known)
+
+
 def read_problem(
     src: Any,
     dst: Any,
@@ -71,11 +109,14 @@ def read_problem(
     confidence: Any = None,
     pairs: Any = None,
 ) -> Problem:
-    """``make_problem`` with everything concrete left in numpy, in ``dtype`` (None: JAX's choice).
+    """A problem whose concrete numbers are left in numpy, in ``dtype`` (None: JAX's choice).
 
-    Under jit, jnp would trace what is read and checked here.
+    ``make_problem`` and ``host_problem`` read by it. Under jit, jnp would trace what is read and checked here.
+
+    Raises:
+        ValueError: As ``make_problem``.
     """
-    src, dst = _points(src, "src"), _points(dst, "dst")
+    src, dst = reading.point_rows(src, "src"), reading.point_rows(dst, "dst")
     if src.shape[0] != dst.shape[0]:
         raise ValueError(
             f"src has {src.shape[0]} rows and dst has {dst.shape[0]}: rows are matches, row i of src "
@@ -84,21 +125,23 @@ def read_problem(
     n = src.shape[0]
     if dtype is None:
         dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
-    noise_bound = _numbers(noise_bound, "noise_bound", n)
-    confidence = np.ones(n) if confidence is None else _numbers(confidence, "confidence", n)
-    mask = np.ones(n, bool) if mask is None else _mask(mask, n)
-    pairs = None if pairs is None else _pairs(pairs, n)
-    cbar2 = _scalar(cbar2, "cbar2")
-    scale = None if scale is None else _scale(scale)
-    _check_values(src, dst, noise_bound, mask, confidence, dtype)
-
-    def ready(x: Any) -> Any:
-        return x.astype(dtype)
-
+    noise_bound = reading.one_a_match(noise_bound, "noise_bound", n)
+    confidence = np.ones(n) if confidence is None else reading.one_a_match(confidence, "confidence", n)
+    mask = np.ones(n, bool) if mask is None else reading.truth_values(mask, n)
+    pairs = None if pairs is None else reading.row_pairs(pairs, n)
+    cbar2 = reading.positive_number(cbar2, "cbar2")
+    scale = None if scale is None else reading.known_scale(scale)
+    reading.check_values(src, dst, noise_bound, mask, confidence, dtype)
     return Problem(
-        ready(src), ready(dst), ready(noise_bound), ready(cbar2), mask, ready(confidence),
-        None if scale is None else ready(scale), None if pairs is None else pairs.astype(np.int32),
-    )  # fmt: skip
+        src=src.astype(dtype),
+        dst=dst.astype(dtype),
+        noise_bound=noise_bound.astype(dtype),
+        cbar2=cbar2.astype(dtype),
+        mask=mask,
+        confidence=confidence.astype(dtype),
+        scale=None if scale is None else scale.astype(dtype),
+        pairs=None if pairs is None else pairs.astype(np.int32),
+    )
 
 
 def stack_problems(problems: Sequence[Problem]) -> Problem:
@@ -159,210 +202,38 @@ def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
         pairs=None if problem.pairs is None else pad(problem.pairs, m or problem.pairs.shape[0], 0),
     )
 
+@jax.jit  # one operation for those who call it outside jit
+def clean(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
+    """The problem with unusable rows masked and made harmless, and the count of rows that are not finite.
 
-CONCRETE = (np.ndarray, float, int, type(None))
+    Whoever solves a problem cleans it once, at the door; the stages receive clean rows and never ask again.
+    Values are replaced *before* anything is computed from them, so that neither results nor
+    gradients of the other rows see a NaN. Without a truncation or a known scale that makes sense, no row can
+    be used.
 
-
-def is_traced(*values: Any) -> bool:
-    """Whether any leaf is a tracer, so that its value is not known."""
-    unclear = [x for x in values if not isinstance(x, CONCRETE)]
-    return bool(unclear) and any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
-
-
-def as_numpy(value: Any, name: str) -> np.ndarray:
-    """A numpy view or copy of anything with ``__array__`` or ``__dlpack__``, or nested lists."""
-    if value is None:
-        raise ValueError(f"{name} is missing: None was given where numbers are needed.")
-    try:
-        if isinstance(value, np.ma.MaskedArray):
-            return _filled(value)
-        if hasattr(value, "__dlpack__") and not hasattr(value, "__array__"):
-            return np.from_dlpack(value)
-        return np.asarray(value)
-    except (TypeError, ValueError, RuntimeError, BufferError) as error:
-        raise ValueError(
-            f"{name} cannot be read as an array ({type(value).__name__}: {error}). Give an array on "
-            "the host, or anything with __array__ or __dlpack__."
-        ) from error
-
-
-def _filled(array: np.ma.MaskedArray) -> np.ndarray:
-    """What is hidden must not come back as a number: it becomes NaN, or False among truth values."""
-    if not np.ma.is_masked(array):
-        return array.data
-    if array.dtype.kind == "b":
-        return array.filled(False)
-    return np.ma.filled(array.astype(np.float64) if array.dtype.kind in "iu" else array, np.nan)
-
-
-def _array(value: Any, name: str) -> Any:
-    return value if is_traced(value) else as_numpy(value, name)
-
-
-def _floats(value: Any, name: str) -> Any:
-    """Real numbers as a tracer, or as a numpy array in the machine's own byte order."""
-    array = _array(value, name)
-    if array.dtype.kind not in "fiub" and array.dtype != jnp.bfloat16:
-        raise ValueError(
-            f"{name} has dtype {array.dtype}: expected real numbers. Convert it, for instance with "
-            "numpy.asarray(x, dtype=float)."
-        )
-    if array.dtype.kind == "b":
-        raise ValueError(f"{name} holds truth values: expected real numbers.")
-    if is_traced(array):
-        return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
-    known = array.dtype.kind != "f" or array.dtype.itemsize > 8 or not array.dtype.isnative
-    return array.astype(np.float64) if known else array
-
-
-def _points(value: Any, name: str) -> Any:
-    array = _floats(value, name)
-    shape = array.shape
-    if 0 in shape:
-        raise ValueError(
-            f"{name} is empty (shape {shape}): an answer that can be trusted needs at least 5 matches (rows)."
-        )
-    if len(shape) == 2 and shape[0] == 3 and shape[1] != 3:
-        raise ValueError(f"{name} has shape {shape}: points are rows, so pass {name}.T of shape (n, 3).")
-    if len(shape) != 2 or shape[1] != 3:
-        raise ValueError(
-            f"{name} has shape {shape}: expected (n, 3), one point a row; pass {name}[:, :3] if more columns "
-            "follow the coordinates."
-        )
-    return array
-
-
-def _numbers(value: Any, name: str, n: int) -> Any:
-    array = _floats(value, name)
-    if array.shape not in ((), (n,)):
-        raise ValueError(f"{name} has shape {array.shape}: expected one number or one a match, ({n},).")
-    return jnp.broadcast_to(array, (n,)) if is_traced(array) else np.broadcast_to(array, (n,))
-
-
-def _scalar(value: Any, name: str) -> Any:
-    array = _floats(value, name)
-    if array.shape != ():
-        raise ValueError(f"{name} has shape {array.shape}: expected one number.")
-    if not is_traced(array) and not (np.isfinite(array) and array > 0):
-        raise ValueError(f"{name} is {array}: give a number above 0.")
-    return array
-
-
-def _scale(value: Any) -> Any:
-    array = _array(value, "scale")
-    if array.dtype.kind in "US":
-        raise ValueError(f"scale is the text '{array}': give a number, or pass scale=None to estimate it.")
-    return _scalar(array, "scale")
-
-
-def _mask(value: Any, n: int) -> Any:
-    array = _array(value, "mask")
-    if array.shape != (n,) or array.dtype.kind != "b":
-        convertible = array.shape == (n,) and array.dtype.kind in "iuf"
-        raise ValueError(
-            f"mask has shape {array.shape} and dtype {array.dtype}: expected ({n},) truth values, "
-            f"one a match{'; pass mask.astype(bool)' if convertible else ''}."
-        )
-    return array
-
-
-def _pairs(value: Any, n: int) -> Any:
-    if hasattr(value, "edges") and hasattr(value, "nodes"):  # a networkx.Graph
-        value = np.asarray(list(value.edges()), dtype=object).reshape(-1, 2)
-        if not all(isinstance(x, (int, np.integer)) for x in value.ravel()):
-            raise ValueError("the nodes of the pairs graph must be row numbers (integers).")
-        value = value.astype(np.int64)
-    array = _array(value, "pairs")
-    if array.shape[:1] == (0,):
-        raise ValueError("pairs is empty, so that no matches are compared: pass pairs=None to compare all.")
-    if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
-        raise ValueError(
-            f"pairs has shape {array.shape} and dtype {array.dtype}: expected (m, 2) integers, "
-            "the row numbers of each pair."
-        )
-    if not is_traced(array):
-        low, high = int(np.min(array)), int(np.max(array))
-        if low < 0 or high >= n:
-            raise ValueError(f"pairs refer to rows {low} to {high}: rows run from 0 to {n - 1}.")
-    return array
-
-
-def _check_values(src: Any, dst: Any, noise_bound: Any, mask: Any, confidence: Any, dtype: Any) -> None:
-    """Checks of what is concrete; anything traced is left to the solver."""
-    if not is_traced(noise_bound, mask):
-        bounds = noise_bound[mask]
-        if not np.all(bounds > 0):
-            raise ValueError(
-                f"noise_bound contains {bounds[~(bounds > 0)][0]}: it is the largest error of a right match, "
-                "a number above 0 in the unit of the points."
-            )
-        if not np.all(np.isfinite(bounds)):
-            raise ValueError("noise_bound contains infinity: give the largest error of a right match.")
-    if not is_traced(confidence, mask):
-        weights = confidence[mask]
-        if not np.all((weights >= 0) & np.isfinite(weights)):
-            raise ValueError("confidence contains a negative or non-finite number: weights are 0 or above.")
-        if np.any(weights > MOST_CONFIDENCE):  # sums of their products would overflow in float32
-            raise ValueError(f"confidence contains {weights.max():.3g}: divide them all, only ratios count.")
-    if is_traced(src, dst, mask, noise_bound):
-        return
-    usable = finite_rows(src, dst, mask)
-    if mask.any() and not len(src[usable]):
-        raise ValueError(
-            "no row of src and dst is finite: every match holds NaN or infinity. Look where they come from; "
-            "give the finite ones."
-        )
-    if len(src[usable]):
-        _check_resolution(src, dst, noise_bound, usable, dtype)
-
-
-def _check_resolution(src: Any, dst: Any, noise_bound: Any, usable: Any, dtype: Any) -> None:
-    """Numbers so large, or held in so few digits, that the bound is lost in their rounding."""
-    largest = max(extent(src[usable]), extent(dst[usable]))
-    kind, bound = jnp.finfo(dtype), float(noise_bound[usable].min())
-    # Lengths and bounds appear to the fourth power in the test of edges.
-    most, least = float(kind.max) ** 0.25 / 10, float(kind.tiny) ** 0.25 * 10
-    if max(largest, float(noise_bound[usable].max())) > most or bound < least:
-        raise ValueError(
-            f"coordinates reach {largest:.3g} and noise_bound is {bound:.3g}, beyond what {dtype} can "
-            f"square and compare: rescale both to a sensible unit{_lonely_row(src, dst, usable, largest)}."
-        )
-    rounding = float(kind.eps) * largest
-    if rounding > 0.01 * bound:
-        wider = "" if dtype == jnp.float64 else ", or use register(), which does that in float64"
-        raise ValueError(
-            f"coordinates reach {largest:.3g}, where {dtype} resolves {rounding:.2g}: more than 1 % of "
-            f"noise_bound {bound:.3g}. Subtract a common origin from each cloud first{wider}"
-            f"{_lonely_row(src, dst, usable, largest)}."
-        )
-    for name, points in (("src", src), ("dst", dst)):
-        if jnp.issubdtype(points.dtype, jnp.floating):
-            lost = float(jnp.finfo(points.dtype).eps) * extent(points[usable])
-            if lost > 0.1 * bound:
-                raise ValueError(
-                    f"{name} is given in {points.dtype}, which resolves {lost:.2g} at coordinates of "
-                    f"{extent(points[usable]):.3g}: more than a tenth of noise_bound {bound:.3g}. The digits "
-                    f"are lost already: subtract the origin before converting to {points.dtype}."
-                )
-
-
-def _lonely_row(src: Any, dst: Any, usable: Any, largest: float) -> str:
-    """Advice, where a single row is what is too large."""
-    reach = np.maximum(np.abs(src[usable]).max(axis=1), np.abs(dst[usable]).max(axis=1))
-    row = np.arange(len(src))[usable][np.argmax(reach)]
-    usual = float(np.median(reach.astype(np.float64)))
-    if usual * 1e3 >= largest:
-        return ""
-    return f". Half of the matches stay within {usual:.3g}: if row {row} is corrupt, mask it"
-
-
-def finite_rows(src: Any, dst: Any, mask: Any) -> np.ndarray | slice:
-    """What picks the rows of numbers: a slice, which copies nothing, where that is all of them."""
-    if np.all(mask) and np.isfinite(src).all() and np.isfinite(dst).all():
-        return slice(None)
-    return np.asarray(mask) & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
-
-
-def extent(points: Any) -> float:
-    """The largest coordinate, signs apart."""
-    return float(max(points.max(), -points.min()))
+    Gradients: exact for the rows that stay, zero for the others.
+    """
+    finite = (
+        jnp.all(jnp.isfinite(problem.src), axis=1)
+        & jnp.all(jnp.isfinite(problem.dst), axis=1)
+        & jnp.isfinite(problem.noise_bound)
+        & jnp.isfinite(problem.confidence)
+    )
+    usable = problem.mask & finite & (problem.noise_bound > 0) & (problem.confidence > 0)
+    cbar2, scale = problem.cbar2, problem.scale
+    sensible = jnp.isfinite(cbar2) & (cbar2 > 0)
+    if scale is not None:
+        sensible &= jnp.isfinite(scale) & (scale > 0)
+        scale = jnp.where(sensible, scale, 1)
+    usable &= sensible
+    cleaned = replace(
+        problem,
+        cbar2=jnp.where(sensible, cbar2, 1),
+        scale=scale,
+        src=jnp.where(usable[:, None], problem.src, 0),
+        dst=jnp.where(usable[:, None], problem.dst, 0),
+        noise_bound=jnp.where(usable, problem.noise_bound, 1),
+        confidence=jnp.where(usable, problem.confidence, 0),
+        mask=usable,
+    )
+    return cleaned, jnp.sum(problem.mask & ~finite, dtype=jnp.int32)

@@ -4,41 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from teaser_jax.checks import whole_number
-from teaser_jax.packing import pack_problem
-from teaser_jax.problem import finite_rows, is_traced, pad_problem
-from teaser_jax.register import (
-    INSIDE_JIT,
-    Registration,
-    between,
-    buckets,
-    centre,
-    check_settings,
-    concluded,
-    device_clique,
-    edge_dtype,
-    host_problem,
-    registration_of,
-)  # fmt: skip
-from teaser_jax.solve import (
-    Graph,
-    find_edges,
-    find_inliers,
-    find_rotation,
-    find_scale,
-    find_translation,
-    usable_rows,
-)  # fmt: skip
-from teaser_jax.stages.trust import judge
-from teaser_jax.types import Pose, Problem, Settings
+from teaser_jax.engine.frames import centred, with_origins, without_padding
+from teaser_jax.engine.packing import pack_problem, unpack_problem
+from teaser_jax.engine.sizes import size_of
+from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.checks import whole_number
+from teaser_jax.problem import clean, host_problem
+from teaser_jax.register import INSIDE_JIT, Registration
+from teaser_jax.settings import Settings, check_settings
+from teaser_jax.solve import conclude, prepare
+from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
 
 
 @dataclass(frozen=True)
@@ -71,8 +53,17 @@ def profile(
 ) -> Profile:
     """Run ``register`` stage by stage and time each, apart from and after compilation.
 
-    Arguments are those of ``register``. Stages run as programs of their own, so their sum lies
-    above the time of one ``register`` call, in which neighbours are fused.
+    Stages run as programs of their own, so their sum lies above the time of one ``register`` call, in which
+    neighbours are fused.
+
+    Args:
+        src, dst: (n, 3) matched points, row i with row i [length].
+        settings: How to solve.
+        repeats: How often each stage runs after its first call.
+        known: The other arguments of ``register``: ``noise_bound`` [length], ``scale``, ...
+
+    Returns:
+        Seconds of each stage, and the answer.
 
     Raises:
         ValueError: As ``register``, and if ``repeats`` is below 1.
@@ -80,53 +71,47 @@ def profile(
     whole_number("repeats", repeats, 1, what="how often to time each stage after its first call")
     check_settings(settings)
     if is_traced(src, dst, settings, known):
-        raise ValueError(INSIDE_JIT.replace("register", "profile"))
+        raise ValueError(INSIDE_JIT.format("profile"))
     problem = host_problem(src, dst, **known)
-    cold: dict[str, float] = {}
-    warm: dict[str, list[float]] = {}
+    on_host = {"centre", "clique, host"} | ({"rotation"} if settings.rotation.needs_host else set())
+    timed = Stopwatch(repeats, frozenset(on_host))
+    near = timed("centre", centred, problem)
+    sent = pack_problem(near.problem, settings, size_of(problem))
+    with jax.enable_x64(True):
+        p, excluded = timed("clean", clean, unpack_problem(sent))
+        graph = prepare(p, settings, edge_dtype=near.edge_dtype, run=timed)
+        found = timed("clique, device", search_on_device, settings.clique, graph.edge_bits, p.mask)
+        clique = timed("clique, host", finish_on_host, settings.clique, graph.edge_bits, sent.mask, found)
+        solution = jax.device_get(conclude(p, excluded, graph, clique, settings, run=timed))
+    solution = without_padding(with_origins(solution, near.src_origin, near.dst_origin), problem)
+    medians = {name: float(np.median(seconds)) for name, seconds in timed.warm.items()}
+    return Profile(timed.cold, medians, Registration.of(problem, solution))
 
-    def timed(name: str, run: Callable[..., Any], *inputs: Any) -> Any:
-        for repeat in range(repeats + 1):
+
+@dataclass(frozen=True)
+class Stopwatch:
+    """Runs stages, each compiled by itself and some times over, and notes their seconds."""
+
+    repeats: int
+    on_host: frozenset[str]  # names of the stages that are not compiled
+    cold: dict[str, float] = field(default_factory=dict)
+    warm: dict[str, list[float]] = field(default_factory=dict)
+
+    def __call__(self, name: str, stage: Callable[..., Any], *inputs: Any, **choices: Any) -> Any:
+        """Run a stage; what it returns."""
+        run = stage if name in self.on_host else _compiled(stage, tuple(choices))
+        for repeat in range(self.repeats + 1):
             start = time.perf_counter()
-            output = jax.block_until_ready(run(*inputs))
+            output = jax.block_until_ready(run(*inputs, **choices))
             seconds = time.perf_counter() - start
-            cold[name] = seconds if repeat == 0 else cold[name]
-            if repeat > 0:
-                warm.setdefault(name, []).append(seconds)
+            if repeat == 0:
+                self.cold[name] = seconds
+            else:
+                self.warm.setdefault(name, []).append(seconds)
         return output
 
-    usable = finite_rows(problem.src, problem.dst, problem.mask)
-    centred, origins = timed("centre", centre, problem, usable)
-    padded = pad_problem(centred, *buckets(centred))
-    with jax.enable_x64(True):
-        scale, scale_pairs = timed("scale", _find_scale, padded, settings)
-        dtype = edge_dtype(centred, usable)
-        edges = timed("consistency graph", lambda *x: _find_edges(*x, dtype=dtype), padded, scale)
-        graph = Graph(scale, scale_pairs, edges)
-        found = timed("clique, device", _device_clique, padded, graph, settings)
-        clique = timed("clique, host", between, padded, graph, found, found.proved, settings)
-        turn = find_rotation if settings.rotation == "sdp" else _find_rotation  # a solver on the host
-        turned = timed("rotation", turn, padded, scale, clique.members, settings)
-        cascade, _ = timed(
-            "translation", _find_translation, padded, scale, clique.members, turned.rotation, settings
-        )
-        inliers = clique.members
-        if settings.refine:
-            inliers, _ = timed("refinement", _find_inliers, padded, cascade, settings)
-        timed("verdict", _judge, padded, cascade, inliers, clique.members, edges)
-        sent = pack_problem(centred, settings, *buckets(centred))
-        solution = concluded(sent, graph, clique, settings)
-    medians = {name: float(np.median(seconds)) for name, seconds in warm.items()}
-    return Profile(cold, medians, registration_of(solution, problem, origins))
 
-
-@jax.jit
-def _judge(problem: Problem, pose: Pose, inliers: Array, clique: Array, edge_bits: Array) -> Array:
-    settled = jnp.ones((), bool)
-    return judge(usable_rows(problem)[0], pose, inliers, clique, edge_bits, converged=settled)
-
-
-_find_scale, _find_edges, _find_rotation, _find_translation, _find_inliers, _device_clique = (
-    jax.jit(f, static_argnames="dtype" if f is find_edges else ())
-    for f in (find_scale, find_edges, find_rotation, find_translation, find_inliers, device_clique)
-)
+@lru_cache(maxsize=64)
+def _compiled(stage: Callable[..., Any], choices: tuple[str, ...]) -> Callable[..., Any]:
+    """A stage as a program of its own; what it is asked to choose is static."""
+    return jax.jit(stage, static_argnames=choices)

@@ -7,7 +7,6 @@ scalar **last**, ``(x, y, z, w)``, as in the paper.
 from __future__ import annotations
 
 from contextlib import nullcontext
-from types import ModuleType
 from typing import Any, TypeAlias
 
 import jax
@@ -17,19 +16,12 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float
 
-AnyArray: TypeAlias = Any  # numpy's on the host, JAX's on the device: what lives on both sides
+from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.ground.arrays import rounded_product as times
 
 # One-sided Jacobi converges quadratically: over a million random, thin, rank-one and repeated
 # spectra in float64, five sweeps reached rounding; six leave one in reserve.
 JACOBI_SWEEPS = 6
-
-
-def namespace(*arrays: object) -> ModuleType:
-    """``jax.numpy`` if any array is JAX's (tracers included), ``numpy`` otherwise.
-
-    Host results stay float64 although JAX may run with 64-bit types switched off.
-    """
-    return jnp if any(isinstance(a, jax.Array) for a in arrays) else np
 
 
 def rotate(
@@ -63,19 +55,6 @@ def _unit(vector: Float[Array, "3"], fallback: Float[Array, "3"]) -> Float[Array
     return jnp.where(safe, vector * lax.rsqrt(jnp.where(safe, norm2, 1.0)), fallback)
 
 
-def times(a: Array, b: Array) -> Array:
-    """The product, rounded before anything is added to it.
-
-    Compilers fuse a product and a sum where their vectors happen to allow it, so that the last bit
-    would depend on the place in a batch. A comparison between the two prevents that; a reduction of
-    precision to what it is already, a barrier and a cast to bits are all optimised away.
-
-    Gradients: exact.
-    """
-    product = a * b
-    return jnp.maximum(product, jnp.finfo(product.dtype).min)
-
-
 def _inner(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, ""]:
     products = times(a, b)
     return products[0] + products[1] + products[2]
@@ -106,7 +85,7 @@ def singular_frames(
     return left, values, right
 
 
-Axes = tuple[Float[Array, "2 3"], Float[Array, "2 3"]]
+Axes: TypeAlias = tuple[Float[Array, "2 3"], Float[Array, "2 3"]]
 
 
 @custom_vmap

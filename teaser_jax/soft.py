@@ -18,19 +18,20 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.checks import whole_number
-from teaser_jax.problem import is_traced
-from teaser_jax.solve import check_records, solve, usable_rows
-from teaser_jax.stages.gnc import gnc_cost, gnc_weights
+from teaser_jax.ground.arrays import AnyArray, is_traced
+from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.loops import until_settled
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem, clean
+from teaser_jax.refit import check_problem
+from teaser_jax.settings import Settings, check_settings
+from teaser_jax.solution import Solution, Status
+from teaser_jax.solve import solve
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
-from teaser_jax.types import Pose, Problem, Settings, Solution, Status
+from teaser_jax.stages.rotation.gnc import gnc_cost, gnc_weights
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["pose", "weights", "status", "cost", "solution"],
-    meta_fields=[],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SoftSolution:
     """The answer of ``soft_solve``.
@@ -45,13 +46,13 @@ class SoftSolution:
     """
 
     pose: Pose
-    weights: Float[Array, " n"]
-    status: Int[Array, ""]
-    cost: Float[Array, ""]
+    weights: Float[AnyArray, " n"]
+    status: Int[AnyArray, ""]
+    cost: Float[AnyArray, ""]
     solution: Solution
 
     @property
-    def ok(self) -> Bool[Array, ""]:
+    def ok(self) -> Bool[AnyArray, ""]:
         """Whether the pose can be trusted."""
         return self.status == Status.OK
 
@@ -106,14 +107,15 @@ def soft_solve(
 
     References: Yang, Antonante, Tzoumas, Carlone, RA-L 2020 (GNC-TLS); eq. (6).
     """
-    check_records(problem, settings)
+    check_problem(problem)
+    check_settings(settings)
     if np.shape(gnc_mu) != () or (
         not is_traced(gnc_mu) and not (np.isfinite(float(gnc_mu)) and float(gnc_mu) > 0)
     ):
         raise ValueError(f"gnc_mu is {gnc_mu}: expected one finite number above 0.")
     whole_number("iterations", iterations, 1)
     start = solve(lax.stop_gradient(problem), lax.stop_gradient(settings))
-    p, _ = usable_rows(problem)
+    p, _ = clean(problem)
     dtype = p.src.dtype
     mu = jnp.asarray(gnc_mu, dtype)
     sensible = jnp.isfinite(mu) & (mu > 0)
@@ -149,11 +151,11 @@ def _stationary(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[A
 
 
 def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Array, ""]]:
+    """Fit with the weights of the fit before until these stand still; the last pose, and whether they did."""
+
     class Descent(NamedTuple):
         pose: Pose
         weights: Array
-        settled: Array
-        rounds: Array
 
     def weigh(pose: Pose) -> Array:
         r2 = squared_residuals(pose, data.src, data.dst, data.noise_bound)
@@ -167,16 +169,14 @@ def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Arra
     rounding = jnp.minimum(16 * eps * (1 + data.gnc_mu) * reach, LARGEST_CHANGE)
     smallest_change = jnp.maximum(2 * eps**0.5, rounding)
 
-    def step(state: Descent) -> Descent:
+    def step(state: Descent) -> tuple[Descent, Array]:
         weights = data.confidence / data.noise_bound**2 * state.weights
         pose = fit_similarity(data.src, data.dst, weights, data.scale).pose
         found = weigh(pose)
-        settled = jnp.max(jnp.abs(found - state.weights), initial=0) <= smallest_change
-        return Descent(pose, found, settled, state.rounds + 1)
+        return Descent(pose, found), jnp.max(jnp.abs(found - state.weights), initial=0) <= smallest_change
 
-    first = Descent(start, weigh(start), jnp.zeros((), bool), jnp.int32(0))
-    final = lax.while_loop(lambda s: ~s.settled & (s.rounds < iterations), step, first)
-    return final.pose, final.settled
+    final, settled = until_settled(step, Descent(start, weigh(start)), iterations=iterations)
+    return final.pose, settled
 
 
 class _Curvature(NamedTuple):

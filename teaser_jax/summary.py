@@ -23,7 +23,7 @@ def summary(result: Registration) -> str:
         "proved maximum"
         if s.clique_is_maximum
         else "not proved maximum, "
-        f"at most {int(s.clique_upper_bound)} (see Settings.clique, clique_seconds, clique_nodes)"
+        f"at most {int(s.clique_upper_bound)} (see Settings.clique, ExactClique(nodes, seconds))"
     )
     searched = f"{int(s.clique_size)} matches agree pairwise, {proof}"
     if s.clique_size == s.clique_upper_bound and not s.clique_is_maximum:

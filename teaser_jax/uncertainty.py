@@ -6,7 +6,7 @@ in which order and in which frame, differs between libraries and is what ``conve
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -17,19 +17,17 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
-from teaser_jax.problem import is_traced
-from teaser_jax.so3 import AnyArray
-from teaser_jax.solve import refit, usable_rows
-from teaser_jax.stages.invariants import safe_norm, safe_sqrt
+from teaser_jax.ground.arrays import AnyArray, is_traced, safe_norm, safe_sqrt
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem, clean
+from teaser_jax.refit import refit
+from teaser_jax.solution import Solution
 from teaser_jax.stages.refinement import squared_residuals
-from teaser_jax.types import Pose, Problem, Solution
 
 Convention = Literal["right", "ros", "gtsam", "g2o"]
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=["covariance", "information"], meta_fields=["convention"]
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Uncertainty:
     """What ``covariance`` returns. Six coordinates, or seven where the scale is estimated.
@@ -44,7 +42,7 @@ class Uncertainty:
 
     covariance: Float[AnyArray, "*batch d d"]
     information: Float[AnyArray, "*batch d d"]
-    convention: Convention
+    convention: Convention = field(metadata={"static": True})
 
 
 def covariance(
@@ -162,7 +160,7 @@ def _checked(sigma: Any, problem: Problem) -> Any:
 
 @partial(jax.jit, static_argnames="convention")
 def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Convention) -> Uncertainty:
-    p, _ = usable_rows(problem)
+    p, _ = clean(problem)
     pose = jax.tree.map(jnp.asarray, solution.pose)
     deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)
     # About the inliers' middle, where turns and shifts hardly depend on each other: about a far origin the

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from teaser_jax.stages import bits
-from teaser_jax.stages.invariants import PairSlice, fold_pairs, squared_norm, tim_bounds, tims, words
-from teaser_jax.stages.scale import usable_pairs
+from teaser_jax.ground import bits
+from teaser_jax.stages.pairs import PairSlice, fold_pairs, squared_norm, tim_bounds, tims, usable_pairs
 
 
 def rounding_margin(
@@ -28,11 +27,16 @@ def rounding_margin(
     sum and the addition of the bounds.
     """
     reach = [jnp.sqrt(jnp.max(jnp.where(mask, jnp.sum(x * x, axis=1), 0), initial=0)) for x in (src, dst)]
-    return rounding(src.dtype, jnp.abs(scale) * reach[0] + reach[1])
+    return margin_of(src.dtype, jnp.abs(scale) * reach[0] + reach[1])
 
 
-def rounding(dtype: Any, reach: Any) -> Any:
-    """The margin of a dtype for points that reach so far from the origin, both clouds added [length]."""
+def margin_of(dtype: Any, reach: Any) -> Any:
+    """The rounding margin of a dtype, for points of both clouds together that reach so far [length].
+
+    Args:
+        dtype: The type in which edges are tested.
+        reach: The largest distances from the origin, s |a| + |b| [length]; numbers or arrays of them.
+    """
     return 8 * float(jnp.finfo(dtype).eps) * reach
 
 
@@ -84,11 +88,10 @@ def consistency_graph(
             edge = lengths_agree(
                 squared_norm(visited.src_tims), squared_norm(visited.dst_tims), visited.bounds
             )
-            return rows | (edge.astype(jnp.uint32) << lane.astype(jnp.uint32))
+            return bits.with_lane(rows, lane, edge)
 
         # Masked matches reach NaN far, which spares a test in each of n^2 pairs.
-        empty = jnp.zeros((n, words(n)), jnp.uint32)
-        rows = fold_pairs(mark, empty, scaled, dst, jnp.where(mask, reach, jnp.nan), mask)
+        rows = fold_pairs(mark, bits.no_bits(n), scaled, dst, jnp.where(mask, reach, jnp.nan), mask)
         return rows & bits.others(n)
 
     agree = lengths_agree(

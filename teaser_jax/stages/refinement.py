@@ -7,6 +7,7 @@ fit on that set descends (6) and ends at a least squares solution on its own con
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -15,8 +16,25 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
-from teaser_jax.stages.rotation import correlation
-from teaser_jax.types import Pose
+from teaser_jax.ground.loops import until_settled
+from teaser_jax.ground.numbers import count, settle
+from teaser_jax.pose import Pose
+from teaser_jax.stages.rotation.tims import correlation
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Refinement:
+    """Descend the joint cost (6) from the answer of the cascade.
+
+    Attributes:
+        iterations: Cap on the rounds; static.
+    """
+
+    iterations: int = count(50)
+
+    def __post_init__(self) -> None:
+        settle(self)
 
 
 class Fit(NamedTuple):
@@ -68,7 +86,7 @@ def fit_similarity(
 def squared_residuals(
     pose: Pose, src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """|b - s R a - t|^2 / beta^2 of each match [-]. Gradients: exact."""
+    """The squared residual |b - s R a - t|^2 / beta^2 of each match [-]. Gradients: exact."""
     # By components: three sums of three fuse into one pass, a product of matrices does not.
     turned = [sum(pose.rotation[i, j] * src[:, j] for j in range(3)) for i in range(3)]
     r2 = sum((dst[:, i] - pose.scale * turned[i] - pose.translation[i]) ** 2 for i in range(3))
@@ -91,7 +109,7 @@ def refine(
     *,
     scale: Float[Array, ""] | None,
     cbar2: Float[Array, ""],
-    iterations: int = 50,
+    iterations: int,
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
     """The inlier set at the end of the descent from ``pose``, and whether it settled.
 
@@ -103,19 +121,12 @@ def refine(
     """
     weights = jnp.where(mask, 1 / noise_bound**2, 0)
 
-    class Descent(NamedTuple):
-        inliers: Array
-        settled: Array
-        rounds: Array
-
     def agree(pose: Pose) -> Array:
         return mask & (squared_residuals(pose, src, dst, noise_bound) <= cbar2)
 
-    def step(state: Descent) -> Descent:
-        fit = fit_similarity(src, dst, jnp.where(state.inliers, weights, 0), scale)
-        inliers = agree(fit.pose)
-        return Descent(inliers, jnp.all(inliers == state.inliers), state.rounds + 1)
+    def step(inliers: Array) -> tuple[Array, Array]:
+        fit = fit_similarity(src, dst, jnp.where(inliers, weights, 0), scale)
+        found = agree(fit.pose)
+        return found, jnp.all(found == inliers)
 
-    start = Descent(agree(pose), jnp.zeros((), bool), jnp.zeros((), jnp.int32))
-    final = lax.while_loop(lambda s: ~s.settled & (s.rounds < iterations), step, start)
-    return final.inliers, final.settled
+    return until_settled(step, agree(pose), iterations=iterations)

@@ -2,30 +2,67 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass, field
+from numbers import Real
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from teaser_jax.stages.histogram_voting import vote_by_histogram
-from teaser_jax.stages.invariants import (
+from teaser_jax.ground import bits
+from teaser_jax.ground.arrays import is_traced, safe_norm, safe_sqrt
+from teaser_jax.stages.pairs import (
     PairSlice,
     fold_pairs,
-    safe_norm,
-    safe_sqrt,
     squared_norm,
     tim_bounds,
     tims,
     trims,
-    words,
-)  # fmt: skip
-from teaser_jax.stages.voting import vote
-from teaser_jax.types import Criterion
+    usable_pairs,
+)
+from teaser_jax.stages.vote.histogram import vote_by_histogram
+from teaser_jax.stages.vote.sweep import Criterion, vote
 
 FEW_PAIRS = 32768  # that a sweep over all ends decides sooner than histograms
-ScalePairs = UInt32[Array, "n w"] | Bool[Array, " m"]
+ScalePairs: TypeAlias = UInt32[Array, "n w"] | Bool[Array, " m"]
+Limit: TypeAlias = float | Float[Array, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ScaleVote:
+    """Find an unknown scale by the vote over the TRIMs (11).
+
+    Attributes:
+        range: The interval (low, high) to look in, traced [-]. The refined scale may leave it by two parts in
+            a hundred; an answer further away has no consensus.
+    """
+
+    range: tuple[Limit, Limit] = field(default=(0.0, float("inf")))
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.range, tuple) or len(self.range) != 2:
+            raise ValueError(f"ScaleVote.range is {self.range!r}: expected (low, high).")
+        # JAX rebuilds records from placeholders, too: only what is a number is looked at.
+        limits = tuple(float(x) if isinstance(x, Real) else x for x in self.range)
+        if any(isinstance(x, str) for x in limits) or all(isinstance(x, float) for x in limits):
+            self._check(limits)
+        object.__setattr__(self, "range", limits)
+
+    def check_concrete(self) -> None:
+        """Check that both limits are known numbers in order; tracers pass. Raises ValueError."""
+        if not is_traced(self.range):
+            self._check(self.range)
+
+    def _check(self, limits: tuple[Any, ...]) -> None:
+        try:
+            low, high = (float(x) for x in limits)
+        except (TypeError, ValueError):
+            raise ValueError(f"ScaleVote.range is {self.range!r}: expected two numbers.") from None
+        if not 0 <= low < high:
+            raise ValueError(f"ScaleVote.range is {self.range!r}: expected (low, high) with 0 <= low < high.")
 
 
 def estimate_scale(
@@ -103,27 +140,17 @@ def scale_of_pairs(
     else:
         # Weights per pair are products c_i c_j: fold them in as rows against columns.
         def add(sums: tuple[Array, Array], lane: Array, visited: PairSlice) -> tuple[Array, Array]:
-            hit = ((chosen >> lane.astype(jnp.uint32)) & 1).astype(bool) & visited.valid
-            column = _columns(confidence, lane)
-            weight = jnp.where(hit, confidence[:, None] * column[None] / visited.bounds**2, 0)
+            hit = bits.lane_of(chosen, lane) & visited.valid
+            both = confidence[:, None] * by_lane[lane]
+            weight = jnp.where(hit, both / visited.bounds**2, 0)
             a2, b2 = squared_norm(visited.src_tims), squared_norm(visited.dst_tims)
             return sums[0] + jnp.sum(weight * safe_sqrt(a2 * b2)), sums[1] + jnp.sum(weight * a2)
 
+        by_lane = bits.in_lanes(confidence)
         zero = jnp.zeros((), src.dtype)
         everything = jnp.ones(src.shape[0], bool)
         above, below = fold_pairs(add, (zero, zero), src, dst, noise_bound, everything)
     return jnp.where(below > 0, above / jnp.where(below > 0, below, 1), 0)
-
-
-def usable_pairs(pairs: Int[Array, "m 2"], mask: Bool[Array, " n"]) -> Bool[Array, " m"]:
-    """Pairs of two different usable matches."""
-    return mask[pairs[:, 0]] & mask[pairs[:, 1]] & (pairs[:, 0] != pairs[:, 1])
-
-
-def _columns(values: Float[Array, " n"], lane: Int[Array, ""]) -> Float[Array, " w"]:
-    """The entries at columns 32 w + lane."""
-    w = words(values.shape[0])
-    return jnp.pad(values, (0, 32 * w - values.shape[0])).reshape(w, 32)[:, lane]
 
 
 class CompleteTrims:
@@ -185,11 +212,10 @@ def _agreeing_pairs(
         agree = (jnp.abs(b - scale * a) <= c * visited.bounds) & visited.valid & (a2 > 0)
         agree &= b > c * visited.bounds
         weight = jnp.where(agree, 1 / visited.bounds**2, 0)
-        rows |= agree.astype(jnp.uint32) << lane.astype(jnp.uint32)
+        rows = bits.with_lane(rows, lane, agree)
         return rows, above + jnp.sum(weight * a * b), below + jnp.sum(weight * a2)
 
-    n = src.shape[0]
     zero = jnp.zeros((), src.dtype)
-    start = (jnp.zeros((n, words(n)), jnp.uint32), zero, zero)
+    start = (bits.no_bits(src.shape[0]), zero, zero)
     rows, above, below = fold_pairs(mark, start, src, dst, noise_bound, mask)
     return above / jnp.where(below > 0, below, 1), rows

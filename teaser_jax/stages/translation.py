@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from teaser_jax.stages.voting import vote
-from teaser_jax.types import Criterion
+from teaser_jax.stages.vote.sweep import Criterion, vote
 
 
 def estimate_translation(

@@ -1,1 +1,0 @@
-"""Many problems on all devices there are."""

@@ -1,0 +1,157 @@
+"""Frames and precision: clouds about their middles, edges in float32 where that will do, and the way back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from teaser_jax import so3
+from teaser_jax.engine.packing import PackedProblem
+from teaser_jax.ground.bits import words
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem
+from teaser_jax.reading import extent, finite_rows
+from teaser_jax.solution import Solution
+from teaser_jax.stages.consistency import margin_of
+
+
+class Centred(NamedTuple):
+    """A problem about the middles of its clouds, the origins taken away, and the type that edges are tested in."""
+
+    problem: Problem
+    src_origin: Float[np.ndarray, "3"]
+    dst_origin: Float[np.ndarray, "3"]
+    edge_dtype: type
+
+
+def centred(problem: Problem) -> Centred:
+    """The problem about the middle of its usable points; numpy, one problem."""
+    usable = finite_rows(problem.src, problem.dst, problem.mask)
+    src, dst = problem.src[usable], problem.dst[usable]
+    if not len(src):
+        return Centred(problem, np.zeros(3), np.zeros(3), np.float64)
+    src_origin, dst_origin = middle(src), middle(dst)
+    near = replace(problem, src=problem.src - src_origin, dst=problem.dst - dst_origin)
+    dtype: type = np.float64  # a voted scale keeps all digits
+    if problem.scale is not None:
+        least = problem.noise_bound[usable].min()
+        extents = extent(near.src[usable]), extent(near.dst[usable])
+        dtype = np.float32 if float32_will_do(*extents, problem.scale, least, problem.cbar2) else np.float64
+    return Centred(near, src_origin, dst_origin, dtype)
+
+
+def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """The median of each coordinate, the upper one of two, in a third of the time of ``numpy.median``.
+
+    A median, because one absurd coordinate must not move the origin far from the rest.
+    """
+    half = len(points) // 2
+    return np.partition(np.ascontiguousarray(points.T), half, axis=1)[:, half]
+
+
+def float32_will_do(src_extent: Any, dst_extent: Any, scale: Any, least_bound: Any, cbar2: Any) -> Any:
+    """Whether float32 widens no edge test by more than a thousandth of the bound: it is twice as fast.
+
+    No edge is lost in either precision; a few more may be added.
+
+    Args:
+        src_extent, dst_extent: The largest coordinates [length]; numbers, or arrays with one a problem.
+        scale: The known scale [-].
+        least_bound: The smallest noise bound [length].
+        cbar2: Truncation [-].
+    """
+    reach, bound = np.sqrt(3) * (scale * src_extent + dst_extent), np.sqrt(cbar2) * least_bound
+    in_range = (bound > 1e-6) & (reach < 1e6)  # their fourth powers are compared
+    return in_range & (margin_of(np.float32, reach) <= 1e-3 * bound)
+
+
+class CentredStack(NamedTuple):
+    """A packed stack in the frames in which it will be solved."""
+
+    sent: PackedProblem
+    origins: tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3"]] | None  # None: nothing was taken away
+    narrow: Bool[np.ndarray, " b"]  # whose edges float32 can test
+
+
+def centred_stack(sent: PackedProblem) -> CentredStack:
+    """The stack with points moved to their middle where float32 could not tell consistent matches otherwise.
+
+    Most stacks of a study need nothing, and finding the middle takes a quarter of the time of solving
+    a small problem.
+    """
+    narrow = _narrow(sent)
+    if narrow.all():
+        return CentredStack(sent, None, narrow)
+    sent = replace(sent, columns=sent.columns.copy())
+    origins = np.zeros((len(narrow), 3)), np.zeros((len(narrow), 3))
+    for k in np.flatnonzero(~narrow):
+        usable = sent.usable[k]
+        for origin, cloud in zip(origins, sent.clouds, strict=True):
+            if usable.any():
+                origin[k] = middle(cloud[k][:, usable].T)
+                cloud[k] -= origin[k][:, None]
+    return CentredStack(sent, origins, _narrow(sent))
+
+
+def _narrow(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
+    """Which problems of a stack may have their edges tested in float32 where they lie."""
+    if not sent.scale_is_known:  # a voted scale keeps all digits
+        return np.zeros(len(sent.numbers), bool)
+    with np.errstate(invalid="ignore", over="ignore"):  # numbers that make no sense: a status will say so
+        # Rows that the mask hides can but widen the extent: most problems pass with them.
+        narrow = _narrow_among(sent, sent.mask)
+        rest = np.flatnonzero(~narrow)
+        if len(rest):
+            wide = replace(sent, columns=sent.columns[rest], numbers=sent.numbers[rest])
+            usable = wide.usable
+            seen = replace(wide, columns=np.where(usable[:, None], wide.columns, 0))
+            narrow[rest] = _narrow_among(seen, usable)
+    return narrow
+
+
+def _narrow_among(sent: PackedProblem, usable: Bool[np.ndarray, "b n"]) -> Bool[np.ndarray, " b"]:
+    """The same question, where the extents are those of all rows and the bounds those of the usable ones."""
+    b, rows, n = sent.columns.shape
+    clouds = sent.columns.reshape(b, rows * n)[:, : 6 * n].reshape(b, 2, 3 * n)  # a view: no copy of the points
+    extents = np.maximum(clouds.max(axis=2), -clouds.min(axis=2))
+    least = np.where(usable, sent.noise_bound, np.inf).min(axis=1, initial=np.inf)
+    return np.asarray(float32_will_do(extents[:, 0], extents[:, 1], sent.scale, least, sent.cbar2))
+
+
+def with_origins(
+    solution: Solution, src_origin: Float[np.ndarray, "*b 3"], dst_origin: Float[np.ndarray, "*b 3"]
+) -> Solution:
+    """The solution of centred clouds (or of a stack of them) in the frames that these came from."""
+    pose = solution.pose
+    turned = so3.rotate(pose.rotation, src_origin[..., None, :])[..., 0, :]
+    with np.errstate(over="ignore", invalid="ignore"):  # of points at the end of all numbers
+        translation = dst_origin + pose.translation - pose.scale[..., None] * turned
+    translation = np.where(np.isfinite(translation), translation, 0)
+    return replace(solution, pose=Pose(pose.rotation, translation, np.asarray(pose.scale)))
+
+
+def without_padding(solution: Solution, problem: Problem) -> Solution:
+    """The solution in the rows of its problem, or of a stack of them; padding came last."""
+    n = problem.src.shape[-2]
+    m = n if problem.pairs is None else problem.pairs.shape[-2]
+    chosen = solution.selection
+
+    def of_pairs(pair_set: Any) -> Any:
+        if pair_set is None:
+            return None
+        if pair_set.dtype == np.uint32:  # the words of the first n stay as they are
+            return pair_set[..., :n, : words(n)]
+        return pair_set[..., :m]
+
+    selection = replace(
+        chosen,
+        scale_pairs=of_pairs(chosen.scale_pairs),
+        clique=chosen.clique[..., :n],
+        rotation=of_pairs(chosen.rotation),
+        translation=chosen.translation[..., :n, :],
+        inliers=chosen.inliers[..., :n],
+    )
+    return replace(solution, selection=selection, inliers=selection.inliers)

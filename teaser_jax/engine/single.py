@@ -1,0 +1,35 @@
+"""One problem outside jit: centred and packed, then device, host, device."""
+
+from __future__ import annotations
+
+import jax
+
+from teaser_jax.engine.frames import centred, with_origins, without_padding
+from teaser_jax.engine.packing import fetch, pack_problem, unpack, unpack_problem
+from teaser_jax.engine.programs import ON_ONE_DEVICE
+from teaser_jax.engine.sizes import size_of
+from teaser_jax.problem import Problem, clean
+from teaser_jax.settings import Settings
+from teaser_jax.solution import Solution
+from teaser_jax.solve import conclude
+from teaser_jax.stages.clique.maximum import finish_on_host
+
+
+def solve_one(problem: Problem, settings: Settings) -> Solution:
+    """The solution of a problem in float64 numpy, in its own frames and rows.
+
+    Whether JAX's 64-bit types are switched on does not matter.
+    """
+    near = centred(problem)
+    sent = pack_problem(near.problem, settings, size_of(problem))
+    choices = jax.tree.structure(settings)
+    with jax.enable_x64(True):
+        graph, clique, settled = ON_ONE_DEVICE.before(sent, choices, near.edge_dtype)
+        if not settled:
+            clique = finish_on_host(settings.clique, graph.edge_bits, sent.mask, clique)
+        if settings.rotation.needs_host:  # step by step, with a solver on the host in between
+            cleaned, excluded = clean(unpack_problem(sent))
+            solution = jax.device_get(conclude(cleaned, excluded, graph, clique, settings))
+        else:
+            solution = unpack(fetch(ON_ONE_DEVICE.after(sent, graph, clique, choices)))
+    return without_padding(with_origins(solution, near.src_origin, near.dst_origin), problem)

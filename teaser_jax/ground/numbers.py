@@ -1,0 +1,106 @@
+"""Fields of method records: numbers that programs are sent, and counts that programs are compiled for.
+
+A record of a method (``Gnc(factor=1.4, iterations=100)``) states each default and what may be asked for
+where it is defined. *Numbers* are traced: to change one compiles nothing, so whole numbers and numpy's are
+made plain floats at once. *Counts* are static: to change one compiles anew. JAX rebuilds records all the
+time, also from placeholders that are no numbers; only what is a number is checked then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import Field, dataclass, field, fields
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.checks import whole_number
+
+RULE = "rule"
+
+
+@dataclass(frozen=True)
+class NumberRule:
+    """What a number may be: at least ``least``, or above ``above``, and finite unless ``infinite``."""
+
+    least: float = -np.inf
+    above: float = -np.inf
+    infinite: bool = False
+
+    def admits(self, value: float) -> bool:
+        """Whether a number keeps the rule."""
+        return value >= self.least and value > self.above and (self.infinite or bool(np.isfinite(value)))
+
+    @property
+    def words(self) -> str:
+        """What is expected, for an error."""
+        return (
+            f"a number above {self.above:g}" if self.above > -np.inf else f"{self.least:g} or a number above"
+        )
+
+
+@dataclass(frozen=True)
+class CountRule:
+    """What a count may be: a whole number of at least ``least``."""
+
+    least: int
+
+
+def number(default: float, *, least: float = -np.inf, above: float = -np.inf, infinite: bool = False) -> Any:
+    """A traced field of a record.
+
+    Args:
+        default: What the field is unless it is given.
+        least, above: The smallest number that makes sense, or the one below all that do.
+        infinite: Whether infinity makes sense.
+    """
+    return field(default=default, metadata={RULE: NumberRule(least, above, infinite)})
+
+
+def count(default: int, *, least: int = 1, traced: bool = False) -> Any:
+    """A field of a record that holds a whole number; static unless ``traced``.
+
+    Args:
+        default: What the field is unless it is given.
+        least: The smallest number that makes sense.
+        traced: Whether the number is sent to programs instead of being compiled into them.
+    """
+    return field(default=default, metadata={RULE: CountRule(least), "static": not traced})
+
+
+def settle(record: Any) -> None:
+    """Check the numbers that a new record holds, and make plain Python numbers of them.
+
+    Raises:
+        ValueError: If one breaks its rule, or is a text or a truth value.
+    """
+    for each in fields(record):
+        value, rule = getattr(record, each.name), each.metadata.get(RULE)
+        if rule is not None and isinstance(value, str | Real | np.bool_):
+            object.__setattr__(record, each.name, _checked(record, each, value))
+
+
+def check_concrete(record: Any) -> None:
+    """Check that every number of a record is known and keeps its rule; tracers pass.
+
+    Raises:
+        ValueError: If one is missing, no number at all, or out of range.
+    """
+    for each in fields(record):
+        value, rule = getattr(record, each.name), each.metadata.get(RULE)
+        if rule is None or is_traced(value):
+            continue
+        if hasattr(value, "dtype") and np.ndim(value) == 0:
+            value = np.asarray(value).item()
+        _checked(record, each, value)
+
+
+def _checked(record: Any, which: Field[Any], value: Any) -> float | int:
+    """The number as a Python float or int; ValueError if it breaks its rule."""
+    name, rule = f"{type(record).__name__}.{which.name}", which.metadata[RULE]
+    if isinstance(rule, CountRule):
+        return whole_number(name, value, rule.least)
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(float(value)):
+        raise ValueError(f"{name} is {value!r}: expected {rule.words}.")
+    return float(value)

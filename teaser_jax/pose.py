@@ -1,0 +1,98 @@
+"""The pose: a similarity from the frame of the source to that of the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from teaser_jax import so3
+from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pose:
+    """The similarity ``b = s R a + t`` from the source to the target frame, ``T_dst_src``.
+
+    Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind.
+    """
+
+    rotation: Float[AnyArray, "*batch 3 3"]
+    translation: Float[AnyArray, "*batch 3"]
+    scale: Float[AnyArray, "*batch"]
+
+    @classmethod
+    def from_matrix(cls, matrix: Any) -> Pose:
+        """From ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is not a scaled rotation."""
+        xp = namespace(matrix)
+        matrix = xp.asarray(matrix)
+        if matrix.shape[-2:] != (4, 4):
+            raise ValueError(f"a pose matrix has shape (4, 4), received {matrix.shape}")
+        if not isinstance(matrix, jax.core.Tracer):
+            _check_similarity(np.asarray(matrix, np.float64))
+        block = matrix[..., :3, :3]
+        scale = xp.cbrt(xp.linalg.det(block))
+        return cls(block / scale[..., None, None], matrix[..., :3, 3], scale)
+
+    @property
+    def matrix(self) -> Float[AnyArray, "*batch 4 4"]:
+        """``T_dst_src = [s R, t; 0, 1]``."""
+        xp = namespace(self.rotation, self.translation, self.scale)
+        scaled = self.scale[..., None, None] * self.rotation
+        top = xp.concatenate([scaled, self.translation[..., None]], axis=-1)
+        bottom = xp.broadcast_to(xp.asarray([0, 0, 0, 1], top.dtype), (*top.shape[:-2], 1, 4))
+        return xp.concatenate([top, bottom], axis=-2)
+
+    @property
+    def quat(self) -> Float[AnyArray, "*batch 4"]:
+        """Unit quaternion of the rotation, scalar last."""
+        return so3.quat_from_rotation(self.rotation)
+
+    def apply(self, points: Float[AnyArray, "*batch n 3"]) -> Float[AnyArray, "*batch n 3"]:
+        """Source points (rows) in the target frame. Raises ValueError on other shapes than (..., n, 3)."""
+        if points.ndim < 2 or points.shape[-1] != 3:
+            raise ValueError(f"points have shape {points.shape}: expected (n, 3), one point a row.")
+        rotated = so3.rotate(self.rotation, points)
+        return self.scale[..., None, None] * rotated + self.translation[..., None, :]
+
+    def inverse(self) -> Pose:
+        """The pose from the target to the source frame, ``T_src_dst``."""
+        xp = namespace(self.rotation, self.translation, self.scale)
+        transposed = xp.swapaxes(self.rotation, -1, -2)
+        scale = 1 / self.scale
+        moved = so3.rotate(transposed, self.translation[..., None, :])[..., 0, :]
+        return Pose(transposed, -scale[..., None] * moved, scale)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """Composition: ``(T_c_b @ T_b_a).apply(p) == T_c_b.apply(T_b_a.apply(p))``."""
+        moved = self.apply(other.translation[..., None, :])[..., 0, :]
+        rotation = so3.rotate(self.rotation, other.rotation.swapaxes(-1, -2)).swapaxes(-1, -2)
+        return Pose(rotation, moved, self.scale * other.scale)
+
+    def as_scipy(self) -> Rotation:
+        """The rotation as ``scipy.spatial.transform.Rotation``."""
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_matrix(np.asarray(self.rotation))
+
+
+def _check_similarity(matrix: np.ndarray) -> None:
+    """Raise unless each matrix is [s R, t; 0, 1] with s above 0, to one in a thousand."""
+    block = matrix[..., :3, :3]
+    with np.errstate(invalid="ignore"):
+        scale2 = np.cbrt(np.linalg.det(block))[..., None, None] ** 2
+        error = np.abs(np.swapaxes(block, -1, -2) @ block - scale2 * np.eye(3))
+        proper = np.all(error <= 1e-3 * scale2) and np.all(np.linalg.det(block) > 0)
+        bottom = np.allclose(matrix[..., 3, :], [0, 0, 0, 1])
+    if not (proper and bottom and np.all(np.isfinite(matrix))):
+        raise ValueError(
+            "the matrix is not [s R, t; 0, 1] with a positive scale and a rotation: is it transposed, "
+            "sheared or mirrored?"
+        )

@@ -1,0 +1,123 @@
+"""The smooth half of the method: from chosen sets to a pose, in closed form, so that gradients are exact."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from teaser_jax import so3
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem, clean
+from teaser_jax.solution import Selection
+from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
+from teaser_jax.stages.refinement import fit_similarity
+from teaser_jax.stages.rotation.tims import Chosen, correlation, correlation_of_pairs
+from teaser_jax.stages.scale import scale_of_pairs
+from teaser_jax.stages.translation import translation_of_points
+
+
+def refit(problem: Problem, selection: Selection) -> Pose:
+    """The pose from the chosen sets, in closed form: the smooth half of ``solve``.
+
+    Refined selections give the weighted similarity fit over ``inliers``; others give (11) - (13)
+    on the frozen sets with binary weights. Weights are confidence_i / beta_i^2.
+
+    Args:
+        problem: One problem; ``jax.vmap`` takes stacks.
+        selection: Of that problem, as in ``solution.selection``: sets in the order of its rows.
+
+    Returns:
+        The pose from the source to the target frame.
+
+    Raises:
+        ValueError: If they do not belong together.
+
+    Gradients: exact in points, bounds, known scale and confidences; memory O(n) (complete TIM
+    graphs and voted scales: one slice of the pairs at a time). Zero where the rotation is ambiguous.
+    """
+    check_problem(problem)
+    if not isinstance(selection, Selection):
+        raise ValueError(
+            f"refit takes a Selection, received {type(selection).__name__}: give solution.selection."
+        )
+    if jnp.shape(selection.inliers) != problem.src.shape[:1]:
+        raise ValueError(
+            f"src has shape {problem.src.shape} and the selection {jnp.shape(selection.inliers)} rows: "
+            "expected the selection of the same problem."
+        )
+    if problem.scale is None and selection.scale_pairs is None:
+        raise ValueError(
+            "the selection was made with a known scale, and the problem has none: give its scale."
+        )
+    cleaned, _ = clean(problem)
+    return lax.cond(
+        selection.refined,
+        lambda: joint_pose(cleaned, selection),
+        lambda: cascade_pose(cleaned, selection),
+    )
+
+
+def check_problem(problem: Any) -> None:
+    """Check that this is one problem. Raises ValueError."""
+    if not isinstance(problem, Problem):
+        raise ValueError(
+            f"received {type(problem).__name__} for a problem: make one with make_problem(src, dst, "
+            "noise_bound=...)."
+        )
+    if problem.src.ndim != 2:
+        raise ValueError(
+            f"src has shape {problem.src.shape}: expected one problem; use jax.vmap(solve) for a stack."
+        )
+
+
+def joint_pose(p: Problem, selection: Selection) -> Pose:
+    """The weighted similarity fit to the inliers of a refined selection; the problem is clean."""
+    weights = jnp.where(selection.inliers, p.confidence / p.noise_bound**2, 0)
+    fit = fit_similarity(p.src, p.dst, weights, p.scale)
+    return _constant_if_ambiguous(fit.pose, fit.correlation)
+
+
+def cascade_pose(p: Problem, selection: Selection) -> Pose:
+    """The paper's plain cascade on the same sets: scale, rotation, translation; the problem is clean."""
+    if p.scale is not None:
+        scale = p.scale
+    else:
+        assert selection.scale_pairs is not None
+        scale = positive_scale(
+            scale_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, selection.scale_pairs, pairs=p.pairs)
+        )
+    h = _correlation_of(p, selection.clique, selection.rotation)
+    rotation = so3.nearest_rotation(h)
+    offsets = p.dst - scale * so3.rotate(rotation, p.src)
+    translation = translation_of_points(offsets, p.noise_bound, p.confidence, selection.translation)
+    return _constant_if_ambiguous(Pose(rotation, translation, scale), h)
+
+
+def positive_scale(scale: Float[Array, ""]) -> Float[Array, ""]:
+    """The scale, or 1 where nothing could vote: what follows must stay finite."""
+    return jnp.where(scale > 0, scale, 1)
+
+
+def chosen_pairs(p: Problem, members: Bool[Array, " n"]) -> Int[Array, "k 2"]:
+    """The pairs whose TIMs the rotation rests on: those given, or the ring of the members."""
+    return ring_pairs(members) if p.pairs is None else p.pairs
+
+
+def _constant_if_ambiguous(pose: Pose, correlation: Float[Array, "3 3"]) -> Pose:
+    """The pose; without derivative where its rotation could as well be another, as none means anything then."""
+    ambiguous = so3.is_ambiguous(correlation)
+    return jax.tree.map(lambda x: jnp.where(ambiguous, lax.stop_gradient(x), x), pose)
+
+
+def _correlation_of(p: Problem, members: Bool[Array, " n"], chosen: Chosen) -> Float[Array, "3 3"]:
+    """What decides the closed-form rotation (12) on the chosen TIMs; the scale does not matter to it."""
+    if chosen.dtype == jnp.uint32:
+        return correlation_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, chosen)
+    pairs = chosen_pairs(p, members)
+    weight = p.confidence[pairs[:, 0]] * p.confidence[pairs[:, 1]]
+    weight = jnp.where(chosen, weight / tim_bounds(p.noise_bound, pairs) ** 2, 0)
+    return correlation(weight, tims(p.src, pairs), tims(p.dst, pairs))

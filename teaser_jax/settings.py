@@ -1,0 +1,102 @@
+"""How to solve: a record for each choice. What may be asked for is checked here and in the records.
+
+    Settings(clique="greedy")                          # a name stands for the record with its defaults
+    Settings(clique=ExactClique(seconds=5.0))          # numbers are those of the record
+    Settings(rotation=Gnc(factor=1.2), refine=False)
+
+Choices and caps are compiled into programs; numbers (factors, tolerances, ranges, budgets) are sent to them,
+so that new ones compile nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias, get_args
+
+import jax
+
+from teaser_jax.ground.checks import one_of
+from teaser_jax.ground.numbers import check_concrete
+from teaser_jax.stages.clique.clique import CliqueMethod
+from teaser_jax.stages.clique.every_match import EveryMatch
+from teaser_jax.stages.clique.exact import ExactClique
+from teaser_jax.stages.clique.greedy import GreedyClique
+from teaser_jax.stages.clique.oracle import NetworkxClique
+from teaser_jax.stages.refinement import Refinement
+from teaser_jax.stages.rotation.gnc import Gnc
+from teaser_jax.stages.rotation.pair_search import PairSearch
+from teaser_jax.stages.rotation.relaxation import Relaxation
+from teaser_jax.stages.scale import ScaleVote
+from teaser_jax.stages.vote.sweep import Criterion
+
+TimGraph: TypeAlias = Literal["chain", "complete"]
+RotationMethod: TypeAlias = Gnc | PairSearch | Relaxation
+
+# What each choice may be, and the names that stand for the records with their defaults.
+SCALES = {"vote": ScaleVote}
+CLIQUES = {"exact": ExactClique, "greedy": GreedyClique, "networkx": NetworkxClique, "none": EveryMatch}
+ROTATIONS = {"gnc": Gnc, "global": PairSearch, "sdp": Relaxation}
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Settings:
+    """How to solve. Choices and caps are static under jit, numbers are traced.
+
+    A name or a truth value stands for the record with its defaults, and equals it:
+    ``Settings(clique="greedy") == Settings(clique=GreedyClique())``.
+
+    Attributes:
+        scale_search: How an unknown scale is found: ``"vote"``, that is ``ScaleVote(range)``.
+        vote: Scalar estimates by ``"tls"`` (11) or by maximum ``"consensus"``.
+        clique: How wrong matches are pruned: ``"exact"``, that is ``ExactClique(nodes, seconds)``;
+            ``"greedy"``; ``"networkx"``, the slow oracle; ``"none"``, not at all.
+        tim_graph: TIMs of the rotation stage: ``"chain"`` of consecutive clique members, closed
+            to a ring, or the ``"complete"`` graph of the clique. Given pairs take their place.
+        rotation: How the rotation is found: ``"gnc"``, that is ``Gnc(factor, tolerance, iterations)``;
+            ``"global"``, that is ``PairSearch(gnc)``; ``"sdp"``, that is ``Relaxation(gnc)``, on the host.
+        refine: Whether the joint cost (6) is descended last: True, that is ``Refinement(iterations)``;
+            False, that is None, gives the paper's plain cascade.
+
+    Raises:
+        ValueError: If a choice is unknown or a number out of range.
+    """
+
+    scale_search: ScaleVote | Any = ScaleVote()
+    vote: Criterion = field(default="tls", metadata={"static": True})
+    clique: CliqueMethod | Any = ExactClique()
+    tim_graph: TimGraph = field(default="chain", metadata={"static": True})
+    rotation: RotationMethod | Any = Gnc()
+    refine: Refinement | None | Any = Refinement()
+
+    def __post_init__(self) -> None:
+        one_of("Settings.vote", self.vote, get_args(Criterion))
+        one_of("Settings.tim_graph", self.tim_graph, get_args(TimGraph))
+        for name, known in (("scale_search", SCALES), ("clique", CLIQUES), ("rotation", ROTATIONS)):
+            choice = getattr(self, name)
+            if isinstance(choice, str):  # anything else is a record, or a placeholder of JAX
+                one_of(f"Settings.{name}", choice, known)
+                object.__setattr__(self, name, known[choice]())
+        if isinstance(self.refine, str):
+            one_of("Settings.refine", self.refine, (True, False))
+        if isinstance(self.refine, bool):
+            object.__setattr__(self, "refine", Refinement() if self.refine else None)
+
+
+def check_settings(settings: Any) -> None:
+    """Check what records cannot check themselves, because JAX rebuilds them from placeholders.
+
+    Raises:
+        ValueError: If these are no settings, a method is none, or a number is missing or out of range.
+    """
+    if not isinstance(settings, Settings):
+        raise ValueError(f"settings is {settings!r}: expected Settings, as in Settings(clique='greedy').")
+    for name, known in (("scale_search", SCALES), ("clique", CLIQUES), ("rotation", ROTATIONS)):
+        record = getattr(settings, name)
+        if not isinstance(record, tuple(known.values())):
+            one_of(f"Settings.{name}", record, known)
+        check_concrete(record)
+    if not isinstance(settings.refine, Refinement | None):
+        one_of("Settings.refine", settings.refine, (True, False))
+    check_concrete(getattr(settings.rotation, "gnc", settings.rotation))
+    settings.scale_search.check_concrete()

@@ -1,0 +1,114 @@
+"""What became of a problem: its status, the measurements that were trusted, and the pose behind them."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt32
+
+from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.pose import Pose
+
+
+class Status(enum.IntEnum):
+    """What became of a solve. ``OK`` is the only one to act upon. Held as int32 inside JAX."""
+
+    OK = 0
+    TOO_FEW_POINTS = 1
+    NO_CONSENSUS = 2
+    DEGENERATE = 3
+    NOT_CONVERGED = 5  # 4 is kept for answers that have a rival
+
+    @property
+    def advice(self) -> str:
+        """One sentence: what happened and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OK: "The pose is determined by its inliers, and they agree better than chance allows.",
+    Status.TOO_FEW_POINTS: (
+        "Fewer than 3 usable matches: check for non-finite rows, the mask and the confidences, and that "
+        "noise_bound, cbar2 and scale are numbers above 0; or give more matches."
+    ),
+    Status.NO_CONSENSUS: (
+        "No set of matches agrees better than wrong matches would by chance: check that the two "
+        "clouds overlap and that noise_bound is in their unit, or find better matches."
+    ),
+    Status.DEGENERATE: (
+        "The inliers lie on a point or a line compared with noise_bound, so they do not determine "
+        "the rotation or the scale: add matches away from that line."
+    ),
+    Status.NOT_CONVERGED: (
+        "An iteration cap was reached before the inliers settled: raise the iterations of Gnc or of Refinement, "
+        "as in Settings(rotation=Gnc(iterations=200), refine=Refinement(iterations=100))."
+    ),
+}
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Selection:
+    """Which measurements to trust: the discrete half of the method. No gradient flows into it.
+
+    Attributes:
+        scale_pairs: TRIMs in the consensus of the scale: packed bit rows (bit t of word j in row
+            i is the pair (i, 32 j + t)), or a mask of the given pairs, or None: scale known.
+        clique: Members of the clique.
+        rotation: TIMs kept by the rotation stage: by their first member (chain), packed bit rows
+            (complete), or a mask of the given pairs.
+        translation: Points in the consensus of each axis of the translation.
+        inliers: Joint residual within c beta_i when refined, otherwise clique and all three axes.
+        refined: Whether the pose is the joint fit to ``inliers``.
+    """
+
+    scale_pairs: UInt32[AnyArray, "n w"] | Bool[AnyArray, " m"] | None
+    clique: Bool[AnyArray, " n"]
+    rotation: Bool[AnyArray, " k"] | UInt32[AnyArray, "n w"]
+    translation: Bool[AnyArray, "n 3"]
+    inliers: Bool[AnyArray, " n"]
+    refined: Bool[AnyArray, ""]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, repr=False)
+class Solution:
+    """The answer of ``solve``. Finite even when ``status`` says that it failed.
+
+    Attributes:
+        pose: Equal to ``refit(problem, selection)``, if there is an inlier.
+        selection: The sets behind the pose.
+        inliers: ``selection.inliers``, in the user's order.
+        status: A ``Status`` as int32; the first failure sticks.
+        clique_size: Members of the clique.
+        clique_upper_bound: No clique of the consistency graph is larger: proved.
+        clique_is_maximum: Whether the two are equal, which proves the maximum; never without pruning.
+        excluded: Rows left out because they hold NaN or infinity.
+        cost: The joint cost (6) of the pose [-].
+    """
+
+    pose: Pose
+    selection: Selection
+    inliers: Bool[AnyArray, " n"]
+    status: Int[AnyArray, ""]
+    clique_size: Int[AnyArray, ""]
+    clique_upper_bound: Int[AnyArray, ""]
+    clique_is_maximum: Bool[AnyArray, ""]
+    excluded: Int[AnyArray, ""]
+    cost: Float[AnyArray, ""]
+
+    @property
+    def ok(self) -> Bool[AnyArray, ""]:
+        """Whether the pose can be trusted. A proof elsewhere never turns this true."""
+        return self.status == Status.OK
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, jax.core.Tracer) or np.shape(self.status) != ():
+            return f"Solution(status={self.status!r}, inliers of shape {np.shape(self.inliers)})"
+        return (
+            f"Solution(status={Status(int(self.status)).name}, {int(np.sum(self.inliers))} of "
+            f"{np.shape(self.inliers)[-1]} matches, pose={self.pose!r})"
+        )

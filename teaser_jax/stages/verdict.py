@@ -1,0 +1,269 @@
+"""Whether an answer deserves trust: is the pose determined, and is its consensus more than chance?
+
+A maximum clique always exists, also when every match is wrong. Three questions separate an answer
+from an accident. Would the cost notice if the pose turned? How many poses with as many inliers
+would wrong matches produce by themselves? Did the clique's members find a place in one pose at
+all, or only in its mirror image? The thresholds were set on synthetic and real problems, right
+and wrong; ``benchmarks/trust.py`` measures what they are worth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.special import xlogy
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from teaser_jax import so3
+from teaser_jax.ground import bits
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem
+from teaser_jax.solution import Status
+from teaser_jax.stages.refinement import fit_similarity, squared_residuals
+
+# A turn by this angle must cost at least what one outlier costs.
+SMALLEST_TURN = np.deg2rad(20.0)
+# A true consensus falls apart in no pose: on real pairs 0.39 - 0.8 of the clique stays, of a
+# mirrored cloud 0 - 0.2 (0.3 where the noise bound is a sixth of the object).
+LEAST_SHARE_OF_CLIQUE = 0.25
+# A reflection may agree with so many times the members of the clique that the pose agrees with: in a
+# plane both agree with all. On the real pairs mirrored it agreed with 1.3 times as many and more (with
+# equally many on one flat wall), on the same pairs as they are with 0.3 times as many at most.
+MOST_SHARE_OF_MIRROR = 1.25
+# How far refinement may carry a scale out of the range it was looked for in.
+SCALE_SLACK = 0.02
+# Odd numbers that mix the bits of the six words of a row, and of their sum.
+MIX_ROW = np.array([0x9E3779B1, 0x85EBCA6B, 0xC2B2AE35, 0x27D4EB2F, 0x165667B1, 0x7FEB352D], np.uint32)
+MIX_SUM = np.uint32(0x7FEB352D)
+# Poses by chance that are tolerated, as a natural logarithm: one in a hundred.
+LARGEST_LOG_FALSE_ALARMS = float(np.log(1e-2))
+
+
+class Evidence(NamedTuple):
+    """What speaks for a pose and against it; answers can be ranked by it.
+
+    Attributes:
+        usable: Matches that can be used at all.
+        members: Matches in the clique.
+        inliers: Matches that the pose explains.
+        distinct: Those of them that are no copies of another row.
+        is_determined: Whether they fix the rotation, and with it the scale.
+        log_false_alarms: How many poses with as many inliers chance would give, as a logarithm.
+        has_collapsed: Whether most members of the clique found no place in the pose.
+        is_mirrored: Whether a reflection explains the clique better.
+        has_left_range: Whether an unknown scale left the range it was looked for in.
+        has_settled: Whether every iteration settled.
+    """
+
+    usable: Int[Array, ""]
+    members: Int[Array, ""]
+    inliers: Int[Array, ""]
+    distinct: Int[Array, ""]
+    is_determined: Bool[Array, ""]
+    log_false_alarms: Float[Array, ""]
+    has_collapsed: Bool[Array, ""]
+    is_mirrored: Bool[Array, ""]
+    has_left_range: Bool[Array, ""]
+    has_settled: Bool[Array, ""]
+
+
+def evidence_of(
+    problem: Problem,
+    pose: Pose,
+    inliers: Bool[Array, " n"],
+    clique: Bool[Array, " n"],
+    edge_bits: UInt32[Array, "n w"],
+    *,
+    has_settled: Bool[Array, ""],
+    pruned: bool = True,
+    scale_range: tuple[Any, Any] = (0.0, float("inf")),
+) -> Evidence:
+    """Collect what speaks for a pose and against it.
+
+    Args:
+        problem: Clean.
+        pose: The candidate, from the source to the target frame.
+        inliers: The matches that it explains.
+        clique: The clique it came from.
+        edge_bits: The consistency graph.
+        has_settled: Whether every iteration settled.
+        pruned: Whether ``clique`` is one.
+        scale_range: Where an unknown scale was looked for [-].
+
+    Gradients: none; inputs must be stopped by the caller.
+    """
+    dtype = problem.src.dtype
+    members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
+    # A match that is listed again says nothing new.
+    once = ~repeats(problem)
+    alarms = log_false_alarms(
+        replace(problem, mask=problem.mask & once), pose, inliers & once, bits.count(edge_bits)
+    )
+    fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
+    no = jnp.zeros((), bool)
+    low, high = scale_range
+    outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
+    return Evidence(
+        usable=jnp.sum(problem.mask, dtype=jnp.int32),
+        members=members,
+        inliers=agreeing,
+        distinct=jnp.sum(inliers & once, dtype=jnp.int32),
+        is_determined=is_determined(problem, pose, inliers),
+        log_false_alarms=alarms,
+        has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
+        is_mirrored=is_mirrored(problem, inliers, clique),
+        has_left_range=outside if problem.scale is None else no,
+        has_settled=has_settled,
+    )
+
+
+def status_of(evidence: Evidence) -> Int[Array, ""]:
+    """The verdict: the status of the first question that the evidence fails, or OK."""
+    e = evidence
+    by_chance = (e.distinct <= 3) | (e.log_false_alarms > LARGEST_LOG_FALSE_ALARMS)
+    questions = (
+        (e.usable < 3, Status.TOO_FEW_POINTS),
+        # Three matches that agree on their distances always make a pose: they are no evidence.
+        ((e.members < 3) | (e.inliers <= 3), Status.NO_CONSENSUS),
+        (~e.is_determined, Status.DEGENERATE),
+        (by_chance | e.has_left_range | e.has_collapsed | e.is_mirrored, Status.NO_CONSENSUS),
+        (~e.has_settled, Status.NOT_CONVERGED),
+    )
+    verdict = jnp.int32(Status.OK)
+    for failed, status in reversed(questions):
+        verdict = jnp.where(failed, jnp.int32(status), verdict)
+    return verdict
+
+
+def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array, " n"]) -> Bool[Array, ""]:
+    """Whether a reflection explains the clique better than the pose does.
+
+    Lengths do not tell left from right, so a mirrored cloud makes as large a clique as a right one; its
+    flat parts then fit a rotation by themselves.
+    """
+    weights = jnp.where(clique, 1 / problem.noise_bound**2, 0)
+    reflection = fit_similarity(-problem.src, problem.dst, weights, problem.scale).pose
+    r2 = squared_residuals(reflection, -problem.src, problem.dst, problem.noise_bound)
+    by_reflection = jnp.sum(clique & (r2 <= problem.cbar2), dtype=jnp.int32)
+    by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
+    dtype = problem.src.dtype
+    return by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype)
+
+
+def repeats(problem: Problem) -> Bool[Array, " n"]:
+    """Which matches are exact copies of an earlier row.
+
+    Each row is sent to a slot by a hash of its numbers, and compared with the first row that came
+    there. Two different rows in one slot hide copies from each other: one in sixteen at most.
+    """
+    n = problem.src.shape[0]
+    if n == 0:
+        return jnp.zeros(0, bool)
+    rows = jnp.concatenate([problem.src, problem.dst], axis=1)
+    words = lax.bitcast_convert_type(rows.astype(jnp.float32), jnp.uint32)
+    mixed = jnp.sum(words * MIX_ROW, axis=1, dtype=jnp.uint32)
+    slots_log2 = max(4, (16 * n - 1).bit_length())
+    slot = ((mixed ^ (mixed >> 15)) * MIX_SUM >> (32 - slots_log2)).astype(jnp.int32)
+    index = jnp.arange(n, dtype=jnp.int32)
+    first = jnp.full(1 << slots_log2, n - 1, jnp.int32).at[slot].min(index)[slot]
+    return (first < index) & jnp.all(rows == rows[first], axis=1)
+
+
+def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:
+    """Whether the inliers fix the rotation (and with it the scale).
+
+    Turning the pose by an angle about its weakest axis raises the cost (6) by
+    2 s (1 - cos angle)(tr M - largest eigenvalue of M), with M = R^T H the symmetric part of the
+    turned-back correlation: a line has nothing left, a mirror image subtracts it. Weights are those
+    of the fit, the largest confidence counting as one: where two matches have all the weight, the
+    rest cannot hold the pose. And a source that shrinks into the noise (s times its radius within
+    c beta) agrees with every rotation.
+    """
+    weights = jnp.where(inliers, problem.confidence / problem.noise_bound**2, 0)
+    fit = fit_similarity(problem.src, problem.dst, weights, problem.scale)
+    most = jnp.max(jnp.where(inliers, problem.confidence, 0), initial=0)
+    turned = jnp.sum(pose.rotation[:, :, None] * fit.correlation[:, None, :], axis=0)
+    left = jnp.trace(turned) - so3.largest_eigenvalue((turned + turned.T) / 2)
+    rise = 2 * (1 - np.cos(SMALLEST_TURN)) * pose.scale * left / jnp.where(most > 0, most, 1)
+    radius2 = jnp.where(inliers, jnp.sum((problem.src - fit.src_mean) ** 2, axis=1), 0)
+    reach2 = jnp.where(inliers, problem.cbar2 * problem.noise_bound**2, jnp.inf)
+    extended = pose.scale**2 * jnp.max(radius2, initial=0) > jnp.min(reach2, initial=jnp.inf)
+    return (rise >= problem.cbar2) & extended
+
+
+def log_false_alarms(
+    problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"]
+) -> Float[Array, ""]:
+    """The logarithm of the expected number of poses with as many inliers if all matches were wrong.
+
+    Three matches that agree on their distances make a pose; the rest of its inliers must come by
+    chance. So: the number of triangles in a random graph of the same degrees, times the
+    probability that such a pose collects as many further inliers, from the counts of poses
+    through one match turned at random. These counts vary more than a Poisson law allows where
+    matches crowd together, so their mean and variance set a negative binomial, whose tail is
+    bounded by Chernoff.
+
+    References: a-contrario reasoning after Moisan and Stival, IJCV 2004; Chung and Lu for the graph.
+    """
+    dtype = problem.src.dtype
+    counts = chance_inliers(problem, pose, inliers).astype(dtype)
+    # One hit more than seen: some dozens of poses cannot prove that chance never hits.
+    mean = (jnp.sum(counts) + 1) / len(TURNS)
+    excess = jnp.maximum(jnp.mean((counts - mean) ** 2) - mean, 1e-3 * mean)
+    shape = mean**2 / excess
+    further = jnp.maximum(jnp.sum(inliers) - 3, 0).astype(dtype)
+    tail = xlogy(further, further / mean) - (further + shape) * jnp.log((further + shape) / (mean + shape))
+    tail = jnp.where(further > mean, tail, 0)
+    degree = degrees.astype(dtype)
+    ends = jnp.maximum(jnp.sum(degree), 1)
+    # (sum d^2)^3 / (6 (sum d)^3), scaled to stay finite in float32.
+    triangles = (jnp.sum(degree * (degree / ends)) ** 3) / 6
+    return jnp.log(jnp.maximum(triangles, 1)) - tail
+
+
+def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Int[Array, " k"]:
+    """How many further matches agree with poses through one inlier, turned evenly over SO(3).
+
+    Inliers that huddle within the noise stay together whatever the turn, and many-to-one matches
+    too: they count as chance, as they should.
+    """
+    src, dst, mask = problem.src, problem.dst, problem.mask
+    if src.shape[0] == 0:
+        return jnp.zeros(len(TURNS), jnp.int32)
+    which = jnp.arange(len(TURNS), dtype=jnp.int32) % jnp.maximum(jnp.sum(inliers, dtype=jnp.int32), 1)
+    pivots = bits.listed(inliers)[which]
+    # From the first pivot, so that no digits are lost far from the origin.
+    x, y = (points.T - points[pivots[0]][:, None] for points in (src, dst))
+    a, b, entries = x[:, pivots], y[:, pivots], jnp.asarray(TURNS, src.dtype)
+    # Component by component: pairs of turns and matches are met in one pass and never stored. The barrier
+    # keeps what belongs to a turn alone out of that pass, where a GPU would find it anew for every match.
+    turned = [
+        sum(entries[:, i, k] * pose.rotation[k, j] for k in range(3)) for i in range(3) for j in range(3)
+    ]
+    by_turn = pose.scale * jnp.stack(turned).reshape(3, 3, -1)
+    offset = jnp.stack([b[i] - sum(by_turn[i, j] * a[j] for j in range(3)) for i in range(3)])
+    by_turn, offset = lax.optimization_barrier((by_turn, offset))
+    residual2 = jnp.zeros((), src.dtype)
+    for i in range(3):
+        moved = sum(by_turn[i, j][:, None] * x[j] for j in range(3))
+        residual2 += (y[i] - offset[i][:, None] - moved) ** 2
+    agree = (residual2 <= problem.cbar2 * problem.noise_bound**2) & mask
+    return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
+
+
+def _even_rotations(count: int, smallest_angle: float) -> np.ndarray:
+    """Rotations spread evenly over SO(3) by the super-Fibonacci spiral (Alexa, CVPR 2022), far from none."""
+    s = np.arange(count) + 0.5
+    inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
+    quats = [inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)]
+    rotations = so3.rotation_from_quat(np.stack(quats, axis=1))
+    return rotations[so3.rotation_angle(rotations) > smallest_angle]
+
+
+# Turns away from a candidate: large enough that its own inliers do not come along.
+TURNS = _even_rotations(70, np.deg2rad(45.0))

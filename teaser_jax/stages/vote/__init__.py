@@ -1,0 +1,1 @@
+"""One unknown number from many measurements of it: exact truncated least squares (section VII)."""
