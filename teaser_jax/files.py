@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from teaser_jax.types import Pose
+from teaser_jax.pose import Pose
 
 TEXT = (".txt", ".csv", ".tsv", ".dat", ".xyz")
 CLOUDS = (".ply", ".pcd", ".las", ".laz", ".bin", ".npy", ".obj", ".stl")  # known to newcomers

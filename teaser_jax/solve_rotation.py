@@ -31,15 +31,15 @@ from teaser_jax.certify.rotation import (
     certify_rotation,
     check_tolerance,
     default_iterations,
-)  # fmt: skip
-from teaser_jax.checks import whole_number
-from teaser_jax.problem import is_traced
-from teaser_jax.so3 import AnyArray
-from teaser_jax.stages.quadratic_form import in_frame_of
-from teaser_jax.stages.rotation import estimate_rotation, listed_tims
-from teaser_jax.stages.rotation_global import search
-from teaser_jax.stages.rotation_sdp import Relaxation
-from teaser_jax.types import RotationMethod
+)
+from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.stages.rotation.quadratic_form import in_frame_of
+from teaser_jax.stages.rotation.gnc import gnc_rotation
+from teaser_jax.stages.rotation.tims import listed_tims
+from teaser_jax.stages.rotation.pair_search import search_pairs as search
+from teaser_jax.stages.rotation.relaxation import RelaxationReport as Relaxation
 
 
 @partial(
@@ -79,7 +79,7 @@ def solve_rotation(
     dst: Float[AnyArray, "k 3"],
     *,
     noise_bound: Any,
-    method: RotationMethod = "global",
+    method: Any = "global",
     cbar2: Any = 1.0,
     mask: Bool[AnyArray, " k"] | None = None,
     proof: CertifyMethod | None = "splitting",
@@ -173,7 +173,7 @@ def _search(
     dtype, eye = src.dtype, jnp.eye(3, dtype=src.dtype)
     m, _, constant = in_frame_of(eye, src, dst, noise_bound=noise_bound, cbar2=cbar2, mask=mask, dtype=dtype)
     tims = listed_tims(m.src, m.dst, jnp.ones(len(m.src), dtype), m.mask)
-    rotation = estimate_rotation(tims, cbar2=m.cbar2, dtype=dtype).rotation
+    rotation = gnc_rotation(tims, cbar2=m.cbar2, dtype=dtype).rotation
     if method == "global":
         rotation = jnp.matmul(rotation, search(m.turned(rotation)), precision=lax.Precision.HIGHEST)
     r2 = jnp.sum((dst - so3.rotate(rotation, src)) ** 2, axis=1)

@@ -16,9 +16,10 @@ import pytest
 from jax.sharding import Mesh
 
 import teaser_jax as tj
-from teaser_jax.batch.groups import Size
-from teaser_jax.batch.programs import MOST, NO_ROOM, rooms
-from teaser_jax.batch.run import Solver
+from teaser_jax.engine.sizes import Size
+from teaser_jax.engine.programs import MOST
+from teaser_jax.engine.compaction import ALL_ROWS as NO_ROOM, rows_for as rooms
+from teaser_jax.engine.batch import Solver
 from teaser_jax.synthetic import random_problem
 
 HERE = Path(__file__).parent

@@ -7,7 +7,7 @@ import numpy as np
 import oracles
 import pytest
 
-from teaser_jax.stages import bits
+from teaser_jax.ground import bits
 
 SIZES = [0, 1, 31, 32, 33, 64, 100]
 

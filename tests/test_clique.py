@@ -13,15 +13,12 @@ import pytest
 from jax import lax
 from oracles import clique_number, is_clique, pack, random_graph
 
-from teaser_jax.stages.clique import (
-    Clique,
-    clique_on_device,
-    graph_of,
-    maximum_clique,
-    peeling_bound,
-    search_on_host,
-)
-from teaser_jax.stages.clique_search import search
+from teaser_jax.stages.clique.clique import Clique
+from teaser_jax.stages.clique import clique_on_device, search_on_host
+from teaser_jax.stages.clique.oracle import graph_of
+from teaser_jax.stages.clique.maximum import maximum_clique
+from teaser_jax.stages.clique.greedy import peeling_bound
+from teaser_jax.stages.clique.exact import search_clique as search
 
 N = 64
 BATCH = 300

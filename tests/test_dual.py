@@ -12,7 +12,7 @@ from oracles import BOUND, draw_vectors, rotation_cost, turned
 from teaser_jax.certify.dual import Dual, coupled_guess, dual_matrix, dual_of, reference_guess
 from teaser_jax.certify.projection import project_dual
 from teaser_jax.certify.splitting import reference
-from teaser_jax.stages.quadratic_form import Measurements, cost_matrix
+from teaser_jax.stages.rotation.quadratic_form import Measurements, cost_matrix
 
 matrix_of, free_numbers_of, published = jax.jit(dual_matrix), jax.jit(dual_of), jax.jit(reference_guess)
 coupled = jax.jit(coupled_guess, static_argnames="correct_outliers")

@@ -11,8 +11,8 @@ import pytest
 from oracles import random_matches, set_cost, tls_by_enumeration, tls_cost, unpack
 
 from teaser_jax.stages import histogram_voting, scale
-from teaser_jax.stages.histogram_voting import vote_by_histogram
-from teaser_jax.stages.voting import vote
+from teaser_jax.stages.vote.histogram import vote_by_histogram
+from teaser_jax.stages.vote.sweep import vote
 
 pytestmark = pytest.mark.usefixtures("x64")
 

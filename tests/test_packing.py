@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 import teaser_jax as tj
-from teaser_jax.packing import choices_of, pack_problem, pack_solution, unpack_problem, unpack_solution
+from teaser_jax.packing import choices_of
+from teaser_jax.engine.packing import (
+    pack_problem,
+    pack as pack_solution,
+    unpack_problem,
+    unpack as unpack_solution,
+)
 from teaser_jax.problem import pad_problem, read_problem
 
 CASES = {

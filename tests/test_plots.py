@@ -12,7 +12,7 @@ import pytest
 
 import teaser_jax as tj
 from teaser_jax import plots
-from teaser_jax.stages import bits
+from teaser_jax.ground import bits
 
 
 def drawn(figure) -> np.ndarray:

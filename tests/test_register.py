@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import teaser_jax as tj
-from teaser_jax.register import bucket
+from teaser_jax.engine.sizes import padded_size as bucket
 from teaser_jax.synthetic import descriptor_problem, random_problem
 
 N = 60  # most problems here share one bucket, so two programs serve the file

@@ -13,14 +13,9 @@ import pytest
 from oracles import in_ball, pack, random_matches, random_rotation, unpack
 
 from teaser_jax import so3
-from teaser_jax.stages.rotation import (
-    complete_tims,
-    correlation,
-    correlation_of_pairs,
-    estimate_rotation,
-    listed_tims,
-    ring_tims,
-)  # fmt: skip
+from teaser_jax.stages.rotation.tims import complete_tims, correlation, correlation_of_pairs, listed_tims
+from teaser_jax.stages.rotation.gnc import gnc_rotation as estimate_rotation
+from teaser_jax.stages.pairs import ring_pairs as ring_tims
 
 pytestmark = pytest.mark.usefixtures("x64")
 

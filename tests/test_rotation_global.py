@@ -10,8 +10,8 @@ from oracles import BOUND, best_rotation, draw_vectors, rotation_cost
 
 import teaser_jax as tj
 from teaser_jax.stages import rotation_global
-from teaser_jax.stages.quadratic_form import Measurements
-from teaser_jax.stages.rotation_global import pair_hypotheses, polish, search
+from teaser_jax.stages.rotation.quadratic_form import Measurements
+from teaser_jax.stages.rotation.pair_search import pair_hypotheses, polish, search_pairs as search
 
 found_by = jax.jit(search)
 

@@ -14,8 +14,8 @@ import teaser_jax as tj
 from teaser_jax import CertificateStatus, CertifiedBy
 from teaser_jax.certify.dual import Dual, dual_matrix
 from teaser_jax.certify.relaxation import turned_dual
-from teaser_jax.stages.quadratic_form import Measurements, cost_matrix
-from teaser_jax.stages.rotation_sdp import MAX_RELAXED, relax
+from teaser_jax.stages.rotation.quadratic_form import Measurements, cost_matrix
+from teaser_jax.stages.rotation.relaxation import MAX_RELAXED, relax
 
 pytest.importorskip("scs")
 
@@ -40,7 +40,7 @@ def test_it_finds_the_rotation_from_a_wrong_start(x64):
     # GNC fails here, so rank one of the relaxation is not the merit of its start.
     src, dst, truth = draw_vectors(5, 10, 0.5)
     m = Measurements(jnp.asarray(src / BOUND), jnp.asarray(dst / BOUND), jnp.asarray(1.0), jnp.ones(10, bool))
-    from teaser_jax.stages.rotation_sdp import solve_relaxation
+    from teaser_jax.stages.rotation.relaxation import solve_relaxation
 
     best = solve_relaxation(m)
     assert rotation_cost(src, dst, best.turn) == pytest.approx(best_rotation(src, dst)[1], rel=1e-6)

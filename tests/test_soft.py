@@ -12,7 +12,7 @@ from jax import lax
 from oracles import assert_finite, problem_of, random_matches, solve
 
 import teaser_jax as tj
-from teaser_jax.stages.gnc import gnc_cost, gnc_weights
+from teaser_jax.stages.rotation.gnc import gnc_cost, gnc_weights
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
 
 N = 32

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from oracles import consensus_sets, largest_consensus, mean_of, tls_by_enumeration, tls_cost
 
-from teaser_jax.stages.voting import vote
+from teaser_jax.stages.vote.sweep import vote
 
 pytestmark = pytest.mark.usefixtures("x64")
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 import teaser_jax as tj
-from teaser_jax.batch.processes import all_of, share
+from teaser_jax.engine.processes import all_of, share
 
 
 def main(address: str, count: str, number: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax.certify.dual import Dual
-from teaser_jax.so3 import AnyArray
+from teaser_jax.ground.arrays import AnyArray
 
 
 class CertificateStatus(enum.IntEnum):

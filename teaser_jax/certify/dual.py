@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from teaser_jax.so3 import AnyArray
-from teaser_jax.stages.quadratic_form import COLUMNS, ROWS, Measurements, cost_blocks, cost_matrix
+from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.stages.rotation.quadratic_form import COLUMNS, ROWS, Measurements, cost_blocks, cost_matrix
 
 HIGHEST = lax.Precision.HIGHEST
 

@@ -22,10 +22,13 @@ from jaxtyping import Float
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.pose import certify
-from teaser_jax.checks import whole_number
-from teaser_jax.problem import is_traced
-from teaser_jax.solve import cascade_pose
-from teaser_jax.types import Pose, Problem, Solution
+from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.arrays import is_traced
+from teaser_jax.problem import clean
+from teaser_jax.refit import cascade_pose
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem
+from teaser_jax.solution import Solution
 
 MAX_FOURS = 60  # inliers whose subsets of four are all looked at: half a million
 MAX_PAIRS = 5000
@@ -153,7 +156,7 @@ def error_bounds(
     p, s = jax.tree.map(double, (problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
     with jax.enable_x64(True):
-        cascade = jax.device_get(cascade_pose(p, s.selection))
+        cascade = jax.device_get(cascade_pose(clean(p)[0], s.selection))
     agreed = _Inliers.of(p, cascade, s.selection.clique & s.selection.translation.all(axis=1))
     whole = _Inliers.of(p, s.pose, s.inliers)
     return ErrorBounds(

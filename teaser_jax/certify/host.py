@@ -24,9 +24,9 @@ from teaser_jax.certify.proof import (
     lowest_if_unproved,
     prove,
     read_off,
-)  # fmt: skip
-from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS
-from teaser_jax.stages.quadratic_form import Framed, in_frame_of
+)
+from teaser_jax.engine.compiler import OLDER_EMITTERS, WHOLE_SUMS
+from teaser_jax.stages.rotation.quadratic_form import Framed, in_frame_of
 
 QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
 

@@ -22,16 +22,18 @@ from teaser_jax.certify.rotation import (
     certify_rotation,
     check_tolerance,
     default_iterations,
-)  # fmt: skip
+)
 from teaser_jax.certify.stack import certify_stack
-from teaser_jax.checks import whole_number
-from teaser_jax.problem import is_traced
-from teaser_jax.so3 import AnyArray
-from teaser_jax.solve import cascade_pose, usable_rows
-from teaser_jax.stages import bits
-from teaser_jax.stages.invariants import tim_bounds, tims
-from teaser_jax.stages.rotation import ring_tims
-from teaser_jax.types import Problem, Solution
+from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.refit import cascade_pose
+from teaser_jax.problem import clean as usable_rows
+from teaser_jax.ground import bits
+from teaser_jax.stages.pairs import tim_bounds, tims
+from teaser_jax.stages.pairs import ring_pairs
+from teaser_jax.problem import Problem
+from teaser_jax.solution import Solution
 
 MAX_TRACED = 128  # measurements under jit, where sizes are static
 
@@ -160,13 +162,13 @@ def measurements(problem: Problem, solution: Solution, about: About, members: in
     chosen = solution.selection
     if about == "pose":
         return _about_pose(jnp, p, solution)
-    cascade = cascade_pose(problem, chosen)
+    cascade = cascade_pose(p, chosen)
     clique = chosen.clique & p.mask
     if p.pairs is not None:
         pairs = jnp.asarray(p.pairs)
         exist = clique[pairs[:, 0]] & clique[pairs[:, 1]]
     elif about == "chain":
-        pairs, exist = ring_tims(clique), clique
+        pairs, exist = ring_pairs(clique), clique
     else:
         rows = bits.listed(clique)[:members]
         i, j = (np.asarray(x, np.int32) for x in np.triu_indices(members, 1))
@@ -227,7 +229,7 @@ def _unless(too_large: Bool[Array, ""], found: Certificate) -> Certificate:
 def with_gaps(found: Certificate, problem: Problem, solution: Solution) -> Certificate:
     """What the bound on the clique says of every pose whatever: its inliers are a clique, too."""
     p = problem
-    xp = so3.namespace(p.src, solution.clique_upper_bound)
+    xp = namespace(p.src, solution.clique_upper_bound)
     usable = p.mask & (p.noise_bound > 0) & (p.confidence > 0) & _finite(xp, p)
     most = xp.asarray(solution.clique_upper_bound)
     gap = most - xp.sum(solution.inliers)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax.certify.dual import dual_matrix, reference_guess
 from teaser_jax.certify.projection import project_dual, project_semidefinite, smallest_eigenvalue
-from teaser_jax.stages.quadratic_form import Measurements
+from teaser_jax.stages.rotation.quadratic_form import Measurements
 
 RELAXATION = 1.999999  # any number below 2 converges, and the largest is the fastest in practice
 VECTOR_SCALE = 0.5

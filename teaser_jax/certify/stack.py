@@ -25,7 +25,7 @@ from teaser_jax.certify.host import (
     go_on,
     padded,
     with_blocks,
-)  # fmt: skip
+)
 from teaser_jax.certify.proof import CertifyMethod
 
 CHUNK_BYTES = 256 << 20  # of the matrices of the closed form; some eight of each live at once

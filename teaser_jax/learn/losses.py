@@ -22,7 +22,7 @@ from teaser_jax.learn.matching import (
     log_sum,
     similarities,
 )
-from teaser_jax.types import Pose
+from teaser_jax.pose import Pose
 
 
 def masked_mean(values: Float[Array, "..."], mask: Bool[Array, "..."] | None) -> Float[Array, ""]:

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from teaser_jax.problem import is_traced
+from teaser_jax.ground.arrays import is_traced
 
 
 class Matches(NamedTuple):

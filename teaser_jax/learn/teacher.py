@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 from teaser_jax.learn.matching import as_float, check_positive
 from teaser_jax.problem import make_problem
 from teaser_jax.solve import solve
-from teaser_jax.types import Pose, Settings
+from teaser_jax.pose import Pose
+from teaser_jax.settings import Settings
 
 ON_DEVICE = Settings(clique="greedy")  # no host call inside a training step
 

@@ -20,7 +20,7 @@ from teaser_jax.learn.losses import masked_mean, matching_loss, rotation_loss
 from teaser_jax.learn.matching import check_positive, match
 from teaser_jax.learn.network import Parameters, Scan, describe, read_scan
 from teaser_jax.learn.teacher import Labels, teacher
-from teaser_jax.types import Pose
+from teaser_jax.pose import Pose
 
 
 class Pairs(NamedTuple):

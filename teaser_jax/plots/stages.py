@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 from teaser_jax.register import Registration
-from teaser_jax.stages.bits import unpack_host
+from teaser_jax.ground.bits import unpack_host
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from teaser_jax.types import Pose
+from teaser_jax.pose import Pose
 
 CONFIDENCE = 0.99  # at which RANSAC stops, as in the paper
 FIRST_ITERATIONS = 1000  # that tell how long an iteration takes

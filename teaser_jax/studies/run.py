@@ -16,7 +16,7 @@ import jax
 from jax.sharding import Mesh
 from tqdm import tqdm
 
-from teaser_jax.batch.processes import all_of, check_agreement
+from teaser_jax.engine.processes import all_of, check_agreement
 from teaser_jax.files import FileError, one_line, whole
 from teaser_jax.studies.catalogue import Study, studies
 from teaser_jax.studies.figures import check_drawing, draw_study

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.synthetic.models import Mesh, Points, Seed, sample_model
-from teaser_jax.types import Pose
+from teaser_jax.pose import Pose
 
 SIGMA = 0.01
 BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimensions

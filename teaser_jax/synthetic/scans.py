@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from teaser_jax.synthetic.models import Points, Seed
 from teaser_jax.synthetic.protocol import random_rotation
-from teaser_jax.types import Pose
+from teaser_jax.pose import Pose
 
 Vector = Float[np.ndarray, "3"]
 
