@@ -88,6 +88,7 @@ def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, pool:
 def proved_on_device(stack: tj.Problem) -> np.ndarray:
     """Which cliques the device proves by itself, before the host's turn."""
     from teaser_jax.packing import choices_of, pack_problem
+
     from teaser_jax.register import bucket, until_clique
 
     settings = tj.Settings()

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import jax
 import numpy as np
+from teaser_jax.packing import choices_of, pack_problem, unpack_problem
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
 from benchmarks.problems import Case, real_pairs
 from benchmarks.speed import ours
-from teaser_jax.packing import choices_of, pack_problem, unpack_problem
 from teaser_jax.problem import finite_rows
 from teaser_jax.register import (
     before_clique,

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from teaser_jax.stages.gnc import gnc_weights
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
-from teaser_jax.stages.gnc import gnc_weights
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
 
 BATCH, SIZE, WRONG = 256, 64, 0.5

@@ -1,7 +1,7 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX.
 
-``register`` is the door for one pair on the host; ``solve`` is the same under jit, vmap and grad; ``solve_batch``
-takes thousands. Everything loads when it is first used.
+``register`` is the door for one pair on the host; ``solve`` is the same under jit, vmap and grad;
+``solve_batch`` takes thousands. Everything loads when it is first used.
 """
 
 import sys

@@ -55,7 +55,8 @@ def find_rotation(
 
 
 def find_translation(
-    p: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], rotation: Float[Array, "3 3"], settings: Settings
+    p: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], rotation: Float[Array, "3 3"],
+    settings: Settings,
 ) -> tuple[Float[Array, "3"], Bool[Array, "n 3"]]:  # fmt: skip
     """The vote of each axis (13), and the members behind it."""
     offsets = p.dst - scale * so3.rotate(rotation, p.src)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
+from teaser_jax.ground.arrays import AnyArray, Placeholder, namespace
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -24,9 +24,9 @@ class Pose:
     Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind.
     """
 
-    rotation: Float[AnyArray, "*batch 3 3"]
-    translation: Float[AnyArray, "*batch 3"]
-    scale: Float[AnyArray, "*batch"]
+    rotation: Float[AnyArray, "*batch 3 3"] | Placeholder
+    translation: Float[AnyArray, "*batch 3"] | Placeholder
+    scale: Float[AnyArray, "*batch"] | Placeholder
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Pose:

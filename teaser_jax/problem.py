@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import reading
-from teaser_jax.ground.arrays import AnyArray, is_traced
+from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
 
 
 @jax.tree_util.register_dataclass
@@ -30,14 +30,14 @@ class Problem:
         pairs: Index pairs whose TIMs are used, or None for all. A pair (i, i) is padding.
     """
 
-    src: Float[AnyArray, "n 3"]
-    dst: Float[AnyArray, "n 3"]
-    noise_bound: Float[AnyArray, " n"]
-    cbar2: Float[AnyArray, ""]
-    mask: Bool[AnyArray, " n"]
-    confidence: Float[AnyArray, " n"]
-    scale: Float[AnyArray, ""] | None = None
-    pairs: Int[AnyArray, "m 2"] | None = None
+    src: Float[AnyArray, "*batch n 3"] | Placeholder
+    dst: Float[AnyArray, "*batch n 3"] | Placeholder
+    noise_bound: Float[AnyArray, "*batch n"] | Placeholder
+    cbar2: Float[AnyArray, "*batch"] | Placeholder
+    mask: Bool[AnyArray, "*batch n"] | Placeholder
+    confidence: Float[AnyArray, "*batch n"] | Placeholder
+    scale: Float[AnyArray, "*batch"] | Placeholder | None = None
+    pairs: Int[AnyArray, "*batch m 2"] | Placeholder | None = None
 
 
 def make_problem(
@@ -111,7 +111,8 @@ def read_problem(
 ) -> Problem:
     """A problem whose concrete numbers are left in numpy, in ``dtype`` (None: JAX's choice).
 
-    ``make_problem`` and ``host_problem`` read by it. Under jit, jnp would trace what is read and checked here.
+    ``make_problem`` and ``host_problem`` read by it. Under jit, jnp would trace what is read and checked
+    here.
 
     Raises:
         ValueError: As ``make_problem``.
@@ -201,6 +202,7 @@ def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
         scale=problem.scale,
         pairs=None if problem.pairs is None else pad(problem.pairs, m or problem.pairs.shape[0], 0),
     )
+
 
 @jax.jit  # one operation for those who call it outside jit
 def clean(problem: Problem) -> tuple[Problem, Int[Array, ""]]:

@@ -108,7 +108,7 @@ def chosen_pairs(p: Problem, members: Bool[Array, " n"]) -> Int[Array, "k 2"]:
 
 
 def _constant_if_ambiguous(pose: Pose, correlation: Float[Array, "3 3"]) -> Pose:
-    """The pose; without derivative where its rotation could as well be another, as none means anything then."""
+    """The pose; it has no derivative where its rotation could as well be another: none means anything."""
     ambiguous = so3.is_ambiguous(correlation)
     return jax.tree.map(lambda x: jnp.where(ambiguous, lax.stop_gradient(x), x), pose)
 

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray, is_traced
+from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.pose import Pose
@@ -46,9 +46,9 @@ class SoftSolution:
     """
 
     pose: Pose
-    weights: Float[AnyArray, " n"]
-    status: Int[AnyArray, ""]
-    cost: Float[AnyArray, ""]
+    weights: Float[AnyArray, "*batch n"] | Placeholder
+    status: Int[AnyArray, "*batch"] | Placeholder
+    cost: Float[AnyArray, "*batch"] | Placeholder
     solution: Solution
 
     @property

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
-from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.ground.arrays import AnyArray, Placeholder
 from teaser_jax.pose import Pose
 
 
@@ -43,8 +43,8 @@ _ADVICE = {
         "the rotation or the scale: add matches away from that line."
     ),
     Status.NOT_CONVERGED: (
-        "An iteration cap was reached before the inliers settled: raise the iterations of Gnc or of Refinement, "
-        "as in Settings(rotation=Gnc(iterations=200), refine=Refinement(iterations=100))."
+        "An iteration cap was reached before the inliers settled: raise the iterations of Gnc or of "
+        "Refinement, as in Settings(rotation=Gnc(iterations=200), refine=Refinement(iterations=100))."
     ),
 }
 
@@ -65,12 +65,12 @@ class Selection:
         refined: Whether the pose is the joint fit to ``inliers``.
     """
 
-    scale_pairs: UInt32[AnyArray, "n w"] | Bool[AnyArray, " m"] | None
-    clique: Bool[AnyArray, " n"]
-    rotation: Bool[AnyArray, " k"] | UInt32[AnyArray, "n w"]
-    translation: Bool[AnyArray, "n 3"]
-    inliers: Bool[AnyArray, " n"]
-    refined: Bool[AnyArray, ""]
+    scale_pairs: UInt32[AnyArray, "*batch n w"] | Bool[AnyArray, "*batch m"] | Placeholder | None
+    clique: Bool[AnyArray, "*batch n"] | Placeholder
+    rotation: Bool[AnyArray, "*batch k"] | UInt32[AnyArray, "*batch n w"] | Placeholder
+    translation: Bool[AnyArray, "*batch n 3"] | Placeholder
+    inliers: Bool[AnyArray, "*batch n"] | Placeholder
+    refined: Bool[AnyArray, "*batch"] | Placeholder
 
 
 @jax.tree_util.register_dataclass
@@ -92,13 +92,13 @@ class Solution:
 
     pose: Pose
     selection: Selection
-    inliers: Bool[AnyArray, " n"]
-    status: Int[AnyArray, ""]
-    clique_size: Int[AnyArray, ""]
-    clique_upper_bound: Int[AnyArray, ""]
-    clique_is_maximum: Bool[AnyArray, ""]
-    excluded: Int[AnyArray, ""]
-    cost: Float[AnyArray, ""]
+    inliers: Bool[AnyArray, "*batch n"] | Placeholder
+    status: Int[AnyArray, "*batch"] | Placeholder
+    clique_size: Int[AnyArray, "*batch"] | Placeholder
+    clique_upper_bound: Int[AnyArray, "*batch"] | Placeholder
+    clique_is_maximum: Bool[AnyArray, "*batch"] | Placeholder
+    excluded: Int[AnyArray, "*batch"] | Placeholder
+    cost: Float[AnyArray, "*batch"] | Placeholder
 
     @property
     def ok(self) -> Bool[AnyArray, ""]:

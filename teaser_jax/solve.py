@@ -7,8 +7,8 @@
     refit      the pose from those sets, in closed form: gradients flow
     judge      whether to trust it
 
-The first four are ``select``, all six ``solve``. ``register`` and ``solve_batch`` run the same pieces around the
-host, and ``profile`` times them one by one: a stage is run by ``run``, which they may replace.
+The first four are ``select``, all six ``solve``. ``register`` and ``solve_batch`` run the same pieces around
+the host, and ``profile`` times them one by one: a stage is run by ``run``, which it replaces.
 """
 
 from __future__ import annotations
@@ -123,7 +123,8 @@ def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> UIn
 
 
 def choose(
-    p: Problem, graph: Graph, clique: Clique, settings: Settings, *, cascade: Run = find_cascade, run: Run = plainly
+    p: Problem, graph: Graph, clique: Clique, settings: Settings,
+    *, cascade: Run = find_cascade, run: Run = plainly,
 ) -> tuple[Selection, Bool[Array, ""]]:  # fmt: skip
     """Which measurements of a clean problem to trust, given the clique, and whether every iteration settled.
 

@@ -64,7 +64,7 @@ def solve_batch(
     chunk_size = _check_choices(settings, mesh, chunk_size)
 
     def solved(groups: list[Group], assemble: Callable[[Iterator[Chunk]], Any]) -> Any:
-        """What is assembled of the chunks that this process solves; None if it has no device or no problem."""
+        """What is assembled of the chunks of this process; None if it has no device or no problem."""
         devices = local_mesh(mesh)
         if devices is None or not groups:
             return None

@@ -32,14 +32,13 @@ from teaser_jax.certify.rotation import (
     check_tolerance,
     default_iterations,
 )
+from teaser_jax.ground.arrays import AnyArray, is_traced
 from teaser_jax.ground.checks import whole_number
-from teaser_jax.ground.arrays import is_traced
-from teaser_jax.ground.arrays import AnyArray
-from teaser_jax.stages.rotation.quadratic_form import in_frame_of
 from teaser_jax.stages.rotation.gnc import gnc_rotation
-from teaser_jax.stages.rotation.tims import listed_tims
 from teaser_jax.stages.rotation.pair_search import search_pairs as search
+from teaser_jax.stages.rotation.quadratic_form import in_frame_of
 from teaser_jax.stages.rotation.relaxation import RelaxationReport as Relaxation
+from teaser_jax.stages.rotation.tims import listed_tims
 
 
 @partial(

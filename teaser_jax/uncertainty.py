@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray, is_traced, safe_norm, safe_sqrt
+from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced, safe_norm, safe_sqrt
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import refit
@@ -40,8 +40,8 @@ class Uncertainty:
         convention: Which coordinates, as asked for.
     """
 
-    covariance: Float[AnyArray, "*batch d d"]
-    information: Float[AnyArray, "*batch d d"]
+    covariance: Float[AnyArray, "*batch d d"] | Placeholder
+    information: Float[AnyArray, "*batch d d"] | Placeholder
     convention: Convention = field(metadata={"static": True})
 
 

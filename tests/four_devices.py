@@ -4,10 +4,10 @@ import json
 
 import jax
 import numpy as np
-
-import teaser_jax as tj
 from teaser_jax.batch.programs import programs
 from teaser_jax.packing import choices_of
+
+import teaser_jax as tj
 
 
 def main() -> None:

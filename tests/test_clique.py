@@ -11,17 +11,20 @@ import networkx as nx
 import numpy as np
 import pytest
 from jax import lax
-from oracles import clique_number, is_clique, pack, random_graph
+from oracles import clique_number, is_clique, pack, random_graph, unpack
 
+from teaser_jax.stages.clique import branching, reduction
+from teaser_jax.stages.clique import exact as exact_room
 from teaser_jax.stages.clique.clique import Clique
-from teaser_jax.stages.clique import clique_on_device, search_on_host
-from teaser_jax.stages.clique.oracle import graph_of
-from teaser_jax.stages.clique.maximum import maximum_clique
-from teaser_jax.stages.clique.greedy import peeling_bound
-from teaser_jax.stages.clique.exact import search_clique as search
+from teaser_jax.stages.clique.every_match import EveryMatch
+from teaser_jax.stages.clique.exact import ExactClique, search_clique, two_pentagons
+from teaser_jax.stages.clique.greedy import GreedyClique, peeling_bound
+from teaser_jax.stages.clique.maximum import finish_on_host, maximum_clique, search_on_device
+from teaser_jax.stages.clique.oracle import NetworkxClique, graph_of
 
 N = 64
 BATCH = 300
+METHODS = {"exact": ExactClique(), "greedy": GreedyClique(), "none": EveryMatch()}
 
 
 class Case(NamedTuple):
@@ -92,8 +95,7 @@ def stacked(cases: list[Case]) -> tuple[np.ndarray, np.ndarray]:
 
 
 batched = {
-    method: jax.jit(jax.vmap(partial(maximum_clique, method=method)))
-    for method in ("exact", "greedy", "none")
+    name: jax.jit(jax.vmap(partial(maximum_clique, method=method))) for name, method in METHODS.items()
 }
 one_exact = jax.jit(maximum_clique)
 
@@ -147,15 +149,16 @@ def test_a_batch_equals_a_loop():
 
 
 def test_the_callback_equals_the_host_search():
-    start = jax.jit(clique_on_device)
+    exactly, start = ExactClique(), jax.jit(search_on_device)
     for case, exact in zip(random_cases(), answers("exact", False), strict=True):
-        found = search_on_host(pack(case.dense), case.mask, start(pack(case.dense), case.mask))
+        begun = start(exactly, pack(case.dense), case.mask)
+        found = finish_on_host(exactly, pack(case.dense), case.mask, begun)
         np.testing.assert_array_equal(found.members, exact.members)
         assert int(found.upper_bound) == exact.upper_bound
 
 
 def test_networkx_is_exact_too():
-    run = jax.jit(jax.vmap(partial(maximum_clique, method="networkx")))
+    run = jax.jit(jax.vmap(partial(maximum_clique, method=NetworkxClique())))
     edge_bits, mask = stacked(special_cases())
     chosen = [
         list(SPECIAL).index(k)
@@ -225,9 +228,10 @@ def test_peeling_bound_never_falls_below_what_it_was_given_or_the_truth():
 # --- the host search by itself: larger graphs, budgets ----------------------------------------------
 
 
-def start_of(dense: np.ndarray) -> Clique:
-    """The worst start there is: one vertex, and the trivial bound."""
-    return Clique(np.arange(len(dense)) == 0, np.int32(len(dense)))
+def search(dense: np.ndarray, *, nodes: int = 10**8, seconds: float = 60.0) -> Clique:
+    """The search from the worst start there is: one vertex, and the trivial bound."""
+    start = Clique(np.arange(len(dense)) == 0, np.int32(len(dense)))
+    return search_clique(pack(dense), start, nodes=nodes, seconds=seconds)
 
 
 @pytest.mark.parametrize(
@@ -236,7 +240,7 @@ def start_of(dense: np.ndarray) -> Clique:
 )
 def test_larger_graphs(n, density, planted):
     dense = random_graph(np.random.default_rng(n), n, density, planted)
-    members, upper = search(pack(dense), *start_of(dense))
+    members, upper = search(dense)
     assert is_clique(dense, members)
     assert members.sum() == upper == clique_number(dense)
 
@@ -244,7 +248,7 @@ def test_larger_graphs(n, density, planted):
 def test_exact_from_any_start():
     for case in random_cases()[:100]:
         if case.mask.any():
-            members, upper = search(pack(case.dense), *start_of(case.dense))
+            members, upper = search(case.dense)
             check(case, Clique(members, upper), maximum=True)
 
 
@@ -256,8 +260,8 @@ def test_out_of_budget_the_set_is_a_clique_and_the_bound_holds(budget):
     unproved = 0
     for n, density in ((64, 0.6), (150, 0.5), (200, 0.4), (150, 0.7)):
         dense = random_graph(rng, n, density)
-        members, upper = search(pack(dense), *start_of(dense), **budget)
-        best, proved = search(pack(dense), *start_of(dense))
+        members, upper = search(dense, **budget)
+        best, proved = search(dense)
         assert best.sum() == proved
         assert is_clique(dense, members)
         assert 1 <= members.sum() <= proved <= upper <= n
@@ -269,7 +273,7 @@ def test_out_of_budget_the_set_is_a_clique_and_the_bound_holds(budget):
 def test_budget_holds_under_jit():
     rng = np.random.default_rng(4)
     dense = random_graph(rng, N, 0.8)
-    found = jax.jit(partial(maximum_clique, nodes=1))(pack(dense), np.ones(N, bool))
+    found = one_exact(pack(dense), np.ones(N, bool), ExactClique(nodes=1))
     assert is_clique(dense, np.asarray(found.members))
     assert int(found.members.sum()) <= clique_number(dense) <= int(found.upper_bound)
     assert int(found.members.sum()) < int(found.upper_bound)
@@ -278,17 +282,15 @@ def test_budget_holds_under_jit():
 def test_a_proved_clique_is_returned_as_it_is():
     dense = ~np.eye(5, dtype=bool)
     members = np.array([True, True, True, False, False])
-    found = search_on_host(pack(dense), np.ones(5, bool), Clique(members, np.int32(3)))
+    found = finish_on_host(ExactClique(), pack(dense), np.ones(5, bool), Clique(members, np.int32(3)))
     np.testing.assert_array_equal(found.members, members)
     assert found.upper_bound == 3
 
 
 def test_without_numba_networkx_searches(monkeypatch):
-    from teaser_jax.stages import clique_search
-
-    monkeypatch.setattr(clique_search, "load_kernels", lambda: False)
+    monkeypatch.setattr(exact_room, "load_kernels", lambda: False)
     for case, greedy in list(zip(random_cases(), answers("greedy", False), strict=True))[:50]:
-        check(case, search_on_host(pack(case.dense), case.mask, greedy), maximum=True)
+        check(case, finish_on_host(ExactClique(), pack(case.dense), case.mask, greedy), maximum=True)
 
 
 def test_graph_of_is_the_graph():
@@ -298,3 +300,17 @@ def test_graph_of_is_the_graph():
     np.testing.assert_array_equal(
         nx.to_numpy_array(graph, nodelist=sorted(graph)), case.dense[np.ix_(case.mask, case.mask)]
     )
+
+
+def test_warming_runs_through_every_loop():
+    nothing = Clique(np.zeros(10, bool), np.int32(10))
+    found = search_clique(two_pentagons(), nothing, nodes=100, seconds=60.0)
+    assert found.members.sum() == found.upper_bound == clique_number(unpack(two_pentagons(), 10)) == 4
+    loops = {
+        name: loop
+        for room in (reduction, branching)
+        for name, loop in vars(room).items()
+        if hasattr(loop, "signatures")
+    }
+    assert len(loops) >= 9
+    assert not [name for name, loop in loops.items() if not loop.signatures]

@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 
 import teaser_jax as tj
-from teaser_jax.packing import choices_of
-from teaser_jax.engine.packing import (
-    pack_problem,
-    pack as pack_solution,
-    unpack_problem,
-    unpack as unpack_solution,
-)
+from teaser_jax.engine.packing import pack, pack_problem, unpack, unpack_problem, unpack_settings
+from teaser_jax.engine.sizes import Size
 from teaser_jax.problem import pad_problem, read_problem
+from teaser_jax.settings import ExactClique, Gnc, ScaleVote
 
 CASES = {
     "chain": {},
@@ -34,7 +30,7 @@ def test_nothing_is_lost(case, x64):
     drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
     problem = tj.make_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, **known)
     solution = jax.jit(tj.solve)(problem, settings)
-    found = unpack_solution(jax.device_get(jax.jit(pack_solution)(solution)))
+    found = unpack(jax.device_get(jax.jit(pack)(solution)))
     for before, after in zip(jax.tree.leaves(solution), jax.tree.leaves(found), strict=True):
         assert before.dtype == after.dtype
         np.testing.assert_array_equal(before, after)
@@ -51,18 +47,31 @@ def test_a_problem_arrives_as_it_was(scale, pairs, x64):
         mask=np.arange(5) != 3, cbar2=2.0, scale=scale, pairs=pairs,
     )  # fmt: skip
     settings = tj.Settings(
-        clique_nodes=7, gnc_factor=1.7, gnc_tolerance=1e-3, scale_range=(0.5, 3.0), refine=False
-    )
+        clique=ExactClique(nodes=7), rotation=Gnc(factor=1.7, tolerance=1e-3),
+        scale_search=ScaleVote((0.5, 3.0)), refine=False,
+    )  # fmt: skip
     m = None if pairs is None else 4
-    sent, choices = pack_problem(problem, settings, 8, m), choices_of(settings)
-    assert not jax.tree.leaves(choices)
-    assert choices == choices_of(
-        tj.Settings(clique_nodes=9, refine=False)
-    )  # numbers and budgets compile nothing
-    found, numbers = jax.jit(unpack_problem)(sent, choices)
+    sent, choices = (
+        pack_problem(problem, settings, Size(8, m, scale is not None)),
+        jax.tree.structure(settings),
+    )
+    # Numbers and budgets compile nothing, whole numbers neither.
+    assert choices == jax.tree.structure(tj.Settings(clique=ExactClique(nodes=9, seconds=1), refine=False))
+    found = jax.jit(unpack_problem)(sent)
+    numbers = jax.jit(unpack_settings, static_argnums=1)(sent, choices)
     # Padding is masked, so its bounds do not matter.
     expected = pad_problem(problem, 8, m)
     expected.noise_bound[5:] = 0
     jax.tree.map(np.testing.assert_array_equal, found, expected)
-    assert jax.tree.map(float, numbers) == dataclasses.replace(settings, clique_nodes=1, clique_seconds=0.0)
+    assert jax.tree.structure(numbers) == choices
+    np.testing.assert_array_equal(jax.tree.leaves(numbers), jax.tree.leaves(settings))
     np.testing.assert_array_equal(sent.mask, expected.mask)
+
+
+def test_a_leaf_that_stands_in_a_record_twice_travels_once(x64):
+    """The inliers are a field of the solution and of its selection."""
+    drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
+    problem = tj.make_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+    sent = jax.jit(lambda p: pack(tj.solve(p)))(problem)
+    assert [mask.shape for mask in sent.masks] == [(32, 6)]
+    assert not sent.others

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 
 import jax
 import networkx as nx
@@ -14,7 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 import teaser_jax as tj
-from teaser_jax.engine.sizes import padded_size as bucket
+from teaser_jax.engine import single
+from teaser_jax.engine.programs import ON_ONE_DEVICE, Programs
+from teaser_jax.engine.sizes import padded_size
+from teaser_jax.settings import ExactClique, Gnc, PairSearch, ScaleVote
 from teaser_jax.synthetic import descriptor_problem, random_problem
 
 N = 60  # most problems here share one bucket, so two programs serve the file
@@ -134,13 +136,13 @@ def test_no_edge_in_the_graph_is_no_consensus():
     assert tj.register(src, 3.7 * src**1.5, noise_bound=1e-3).status == tj.Status.NO_CONSENSUS
 
 
-@pytest.mark.parametrize("budget", [dict(clique_nodes=1), dict(clique_seconds=0.0)], ids=str)
+@pytest.mark.parametrize("budget", [dict(nodes=1), dict(seconds=0.0)], ids=str)
 def test_a_spent_budget_is_said_and_its_bound_holds(budget):
     # Agreements of one match in two: too hard for the device, and for one node.
     rng = np.random.default_rng(5)
     src, dst = rng.uniform(size=(N, 3)), rng.uniform(size=(N, 3))
     full = tj.register(src, dst, noise_bound=0.22)
-    cut = tj.register(src, dst, noise_bound=0.22, settings=tj.Settings(**budget))
+    cut = tj.register(src, dst, noise_bound=0.22, settings=tj.Settings(clique=ExactClique(**budget)))
     assert full.solution.clique_is_maximum
     assert not cut.solution.clique_is_maximum
     assert cut.solution.clique_size <= full.solution.clique_size <= cut.solution.clique_upper_bound
@@ -164,9 +166,7 @@ def test_the_summary_says_what_matters(problem, result):
 
 def test_a_stream_of_sizes_shares_programs(problem):
     def programs():
-        from teaser_jax.register import after_clique, before_clique
-
-        return before_clique._cache_size(), after_clique._cache_size()
+        return [program._cache_size() for program in ON_ONE_DEVICE]
 
     answer(problem)
     before = programs()
@@ -177,7 +177,7 @@ def test_a_stream_of_sizes_shares_programs(problem):
 
 
 def test_eight_programs_serve_a_stream():
-    sizes = {n: bucket(n) for n in range(1, 30_001)}
+    sizes = {n: padded_size(n) for n in range(1, 30_001)}
     assert all(size >= n for n, size in sizes.items())
     assert all(size <= max(2 * n, 32) for n, size in sizes.items())
     assert len({sizes[n] for n in range(300, 6001)}) <= 8
@@ -193,8 +193,8 @@ def test_eight_programs_serve_a_stream():
     ],
 )
 def test_after_warmup_nothing_compiles(most, stream):
-    sizes = tj.warmup(most, settings=tj.Settings(gnc_factor=1.5))
-    assert sizes == sorted({bucket(n) for n in range(1, most + 1)})
+    sizes = tj.warmup(most, settings=tj.Settings(rotation=Gnc(factor=1.5)))
+    assert sizes == sorted({padded_size(n) for n in range(1, most + 1)})
     compiled, listening = [], [True]
 
     def listener(event, *_, **__):  # stays registered: older JAX cannot take it back
@@ -206,7 +206,7 @@ def test_after_warmup_nothing_compiles(most, stream):
         drawn = random_problem(n, n=n, outlier_rate=rate, radius=1.0)
         tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
     assert not compiled
-    new = tj.Settings(gnc_iterations=100 + most)
+    new = tj.Settings(rotation=Gnc(iterations=100 + most))
     tj.register(drawn.src[:10], drawn.dst[:10], noise_bound=0.05, settings=new)
     assert compiled  # whatever is new is seen
     listening.clear()
@@ -281,26 +281,33 @@ def test_on_constants_inside_jit_it_names_the_function_to_use_too(problem):
     [
         lambda: {},
         lambda: None,
-        lambda: tj.Settings(gnc_factor=None),
-        lambda: tj.Settings(gnc_factor=np.float32(0.5)),
-        lambda: tj.Settings(gnc_tolerance="x"),
-        lambda: tj.Settings(gnc_tolerance=float("nan")),
-        lambda: tj.Settings(scale_range=None),
-        lambda: tj.Settings(scale_range=(0.0,)),
-        lambda: tj.Settings(scale_range=(0.9, "x")),
-        lambda: tj.Settings(scale_range=(-5.0, -1.0)),
-        lambda: tj.Settings(clique_seconds=None),
-        lambda: tj.Settings(clique_nodes=True),
+        lambda: tj.Settings(rotation=Gnc(factor=None)),
+        lambda: tj.Settings(rotation=Gnc(factor=np.float32(0.5))),
+        lambda: tj.Settings(rotation=PairSearch(gnc=Gnc(factor=np.full((), 0.5)))),
+        lambda: tj.Settings(rotation=Gnc(tolerance="x")),
+        lambda: tj.Settings(rotation=Gnc(tolerance=float("nan"))),
+        lambda: tj.Settings(scale_search=ScaleVote(range=None)),
+        lambda: tj.Settings(scale_search=ScaleVote((0.0,))),
+        lambda: tj.Settings(scale_search=ScaleVote((0.9, "x"))),
+        lambda: tj.Settings(scale_search=ScaleVote((0.9, None))),
+        lambda: tj.Settings(scale_search=ScaleVote((-5.0, -1.0))),
+        lambda: tj.Settings(clique=ExactClique(seconds=None)),
+        lambda: tj.Settings(clique=ExactClique(nodes=True)),
+        lambda: tj.Settings(clique=Gnc()),
+        lambda: tj.Settings(rotation=None),
         lambda: tj.Settings(clique="best"),
         lambda: tj.Settings(refine="no"),
         lambda: tj.Settings(refine=None),
-        lambda: tj.Settings(gnc_factor="2"),
-        lambda: tj.Settings(gnc_iterations=2**31),
+        lambda: tj.Settings(rotation=Gnc(factor="2")),
+        lambda: tj.Settings(rotation=Gnc(iterations=2**31)),
+        lambda: tj.Settings(refine=3),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(problem, settings):
     for call in (tj.register, tj.profile):
-        with pytest.raises(ValueError, match=r"[Ss]ettings.*expected"):
+        with pytest.raises(
+            ValueError, match=r"(settings|Settings|Gnc|ExactClique|ScaleVote)\b.* is .*expected"
+        ):
             call(problem.src, problem.dst, noise_bound=problem.noise_bound, settings=settings())
 
 
@@ -308,6 +315,6 @@ def test_too_many_matches_are_a_memory_error_with_advice(problem, monkeypatch):
     def exhausted(*_):
         raise jax.errors.JaxRuntimeError("INTERNAL: Out of memory allocating 125112025088 bytes.")
 
-    monkeypatch.setattr(sys.modules["teaser_jax.register"], "before_clique", exhausted)
+    monkeypatch.setattr(single, "ON_ONE_DEVICE", Programs(exhausted, exhausted))
     with pytest.raises(MemoryError, match="give fewer"):
         tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound)

@@ -12,8 +12,8 @@ from jax import lax
 from oracles import assert_finite, problem_of, random_matches, solve
 
 import teaser_jax as tj
-from teaser_jax.stages.rotation.gnc import gnc_cost, gnc_weights
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
+from teaser_jax.stages.rotation.gnc import gnc_cost, gnc_weights
 
 N = 32
 soften = jax.jit(lambda problem, gnc_mu: tj.soft_solve(problem, gnc_mu=gnc_mu))

@@ -11,6 +11,7 @@ import pytest
 from oracles import problem_of, random_matches, random_pose, solve
 
 import teaser_jax as tj
+from teaser_jax.settings import Gnc
 
 
 def poses(seed: int, batch: tuple[int, ...] = ()) -> tj.Pose:
@@ -156,10 +157,10 @@ def test_only_zero_is_ok():
 
 def test_settings_keep_choices_static_and_numbers_traced():
     leaves, structure = jax.tree.flatten(tj.Settings())
-    assert sorted(leaves) == sorted([1.4, 1e-6, 0.0, float("inf")])
+    assert sorted(leaves) == sorted([1.4, 1e-6, 0.0, float("inf"), 100_000_000, 60.0])
     other = jax.tree.structure(dataclasses.replace(tj.Settings(), clique="greedy"))
     assert other != structure
-    assert jax.tree.structure(dataclasses.replace(tj.Settings(), gnc_factor=2.0)) == structure
+    assert jax.tree.structure(tj.Settings(rotation=Gnc(factor=2))) == structure
 
 
 def test_unknown_scale_is_structure():

@@ -22,12 +22,11 @@ from jaxtyping import Float
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.pose import certify
-from teaser_jax.ground.checks import whole_number
 from teaser_jax.ground.arrays import is_traced
-from teaser_jax.problem import clean
-from teaser_jax.refit import cascade_pose
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.pose import Pose
-from teaser_jax.problem import Problem
+from teaser_jax.problem import Problem, clean
+from teaser_jax.refit import cascade_pose
 from teaser_jax.solution import Solution
 
 MAX_FOURS = 60  # inliers whose subsets of four are all looked at: half a million

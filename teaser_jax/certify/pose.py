@@ -12,7 +12,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertificateStatus
 from teaser_jax.certify.host import certify_rows, compacted
 from teaser_jax.certify.proof import CertifyMethod
@@ -24,16 +23,14 @@ from teaser_jax.certify.rotation import (
     default_iterations,
 )
 from teaser_jax.certify.stack import certify_stack
-from teaser_jax.ground.checks import whole_number
-from teaser_jax.ground.arrays import is_traced
-from teaser_jax.ground.arrays import AnyArray, namespace
-from teaser_jax.refit import cascade_pose
-from teaser_jax.problem import clean as usable_rows
 from teaser_jax.ground import bits
-from teaser_jax.stages.pairs import tim_bounds, tims
-from teaser_jax.stages.pairs import ring_pairs
+from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import Problem
+from teaser_jax.problem import clean as usable_rows
+from teaser_jax.refit import cascade_pose
 from teaser_jax.solution import Solution
+from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
 
 MAX_TRACED = 128  # measurements under jit, where sizes are static
 

@@ -22,8 +22,8 @@ from teaser_jax.certify.certificate import Certificate, CertificateStatus, Certi
 from teaser_jax.certify.dual import coupled_guess, dual_matrix, dual_of
 from teaser_jax.certify.projection import smallest_eigenvalue
 from teaser_jax.certify.splitting import existing, reaches, reference, rounding, split
-from teaser_jax.stages.rotation.quadratic_form import Measurements
 from teaser_jax.stages.rotation.pair_search import polish
+from teaser_jax.stages.rotation.quadratic_form import Measurements
 
 # Costs below this share of one outlier's are zero: relative gaps say nothing there.
 ABSOLUTE_TOLERANCE = 1e-6

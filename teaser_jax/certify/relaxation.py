@@ -16,7 +16,8 @@ from teaser_jax.certify.host import Rows, cut
 from teaser_jax.certify.proof import Attempt, claim_of, lowest_if_unproved, read_off
 from teaser_jax.certify.splitting import reaches
 from teaser_jax.stages.rotation.quadratic_form import Measurements, in_frame_of
-from teaser_jax.stages.rotation.relaxation import RelaxationReport as Relaxation, report, solve_relaxation
+from teaser_jax.stages.rotation.relaxation import RelaxationReport as Relaxation
+from teaser_jax.stages.rotation.relaxation import report, solve_relaxation
 
 
 class ByRelaxation(NamedTuple):

@@ -20,9 +20,8 @@ from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import certify_rows, compacted
 from teaser_jax.certify.proof import CertifyMethod, prove
 from teaser_jax.certify.stack import certify_stack
+from teaser_jax.ground.arrays import AnyArray, is_traced
 from teaser_jax.ground.checks import whole_number
-from teaser_jax.ground.arrays import is_traced
-from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.stages.rotation.quadratic_form import in_frame_of
 
 TOLERANCE = 1e-3

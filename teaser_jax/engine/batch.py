@@ -130,7 +130,7 @@ class Solver:
         return run_length(size, device_kind(self.mesh)) * self.mesh.size
 
     def chunk_length(self, problems: Problem | list[Problem], chunk_size: int | None, count: int) -> int:
-        """How many problems make a chunk, of so many: whole runs, and by default something for every thread."""
+        """How many of ``count`` problems make a chunk: whole runs, by default something for all threads."""
         run = self.run_length(size_of(problems if isinstance(problems, Problem) else problems[0]))
         most = RUNS_A_CHUNK if self.on_cpu else 1
         runs = min(most, -(-count // (WORKERS * run))) if chunk_size is None else -(-chunk_size // run)
@@ -203,7 +203,7 @@ class Solver:
         return there if self.on_cpu else jax.block_until_ready(there)
 
     def _run(self, program: Callable[..., Any], *args: Any) -> Any:
-        """Run a program; on accelerators alone and to its end, which takes no longer: others pack meanwhile."""
+        """Run a program; on accelerators alone and to its end, which costs nothing: others pack meanwhile."""
         if self.on_cpu:
             return program(*args)
         with self.turn:

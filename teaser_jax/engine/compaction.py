@@ -23,7 +23,9 @@ ALL_ROWS = 0
 
 
 def rows_for(size: Size, settings: Settings, members: Int[np.ndarray, " b"]) -> Int[np.ndarray, " b"]:
-    """The smallest number of rows that holds each clique: a matter of the problem alone, as its last bits depend on it.
+    """The smallest number of rows that holds each clique.
+
+    It is a matter of the problem alone, as the last bits of its answer depend on it.
 
     Args:
         size: What the programs are compiled for.

@@ -19,7 +19,7 @@ from teaser_jax.stages.consistency import margin_of
 
 
 class Centred(NamedTuple):
-    """A problem about the middles of its clouds, the origins taken away, and the type that edges are tested in."""
+    """A problem about the middles of its clouds, the origins taken away, and the type to test edges in."""
 
     problem: Problem
     src_origin: Float[np.ndarray, "3"]
@@ -115,7 +115,9 @@ def _narrow(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
 def _narrow_among(sent: PackedProblem, usable: Bool[np.ndarray, "b n"]) -> Bool[np.ndarray, " b"]:
     """The same question, where the extents are those of all rows and the bounds those of the usable ones."""
     b, rows, n = sent.columns.shape
-    clouds = sent.columns.reshape(b, rows * n)[:, : 6 * n].reshape(b, 2, 3 * n)  # a view: no copy of the points
+    clouds = sent.columns.reshape(b, rows * n)[:, : 6 * n].reshape(
+        b, 2, 3 * n
+    )  # a view: no copy of the points
     extents = np.maximum(clouds.max(axis=2), -clouds.min(axis=2))
     least = np.where(usable, sent.noise_bound, np.inf).min(axis=1, initial=np.inf)
     return np.asarray(float32_will_do(extents[:, 0], extents[:, 1], sent.scale, least, sent.cbar2))

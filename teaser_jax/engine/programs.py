@@ -1,7 +1,7 @@
 """The two device programs: up to the clique, and from the clique on. The host's search lies between them.
 
-Each takes one problem. ``ON_ONE_DEVICE`` compiles them for ``register``; ``on_mesh`` maps them over the problems of a
-batch, on any devices.
+Each takes one problem. ``ON_ONE_DEVICE`` compiles them for ``register``; ``on_mesh`` maps them over the
+problems of a batch, on any devices.
 """
 
 from __future__ import annotations

@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 from types import ModuleType
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# numpy's on the host, JAX's on the device, and while JAX rebuilds records also its placeholders: shapes and
-# dtypes without numbers, axes of vmap, whatever `jax.tree.map` returned.
-AnyArray: TypeAlias = Any
+AnyArray: TypeAlias = Any  # numpy's on the host, JAX's on the device: what lives on both sides
+
+
+if TYPE_CHECKING:
+    Placeholder: TypeAlias = Any
+else:
+
+    class _MayStandForAnArray(type):
+        def __instancecheck__(cls, value: object) -> bool:
+            is_array = hasattr(value, "shape") and hasattr(value, "dtype")
+            return not is_array or value.dtype == jax.dtypes.float0
+
+    class Placeholder(metaclass=_MayStandForAnArray):
+        """What a record may hold where an array is meant, because JAX rebuilds records from other things, too.
+
+        That is an axis of ``vmap``, a sharding, whatever ``jax.tree.map`` returned, and the tangents of truth
+        values, which have no numbers. Shapes without numbers (``jax.ShapeDtypeStruct``) pass for arrays.
+        """
+
 
 CONCRETE = (np.ndarray, float, int, type(None))
 

@@ -1,4 +1,4 @@
-"""Named steps: the method runs its stages by a function that others may replace, to time them for instance."""
+"""Named steps: the method runs its stages by a function that others may replace, to time them."""
 
 from __future__ import annotations
 

@@ -12,10 +12,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax.learn.matching import as_float, check_positive
-from teaser_jax.problem import make_problem
-from teaser_jax.solve import solve
 from teaser_jax.pose import Pose
+from teaser_jax.problem import make_problem
 from teaser_jax.settings import Settings
+from teaser_jax.solve import solve
 
 ON_DEVICE = Settings(clique="greedy")  # no host call inside a training step
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from teaser_jax.register import Registration
 from teaser_jax.ground.bits import unpack_host
+from teaser_jax.register import Registration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

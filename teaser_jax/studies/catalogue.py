@@ -11,12 +11,12 @@ import numpy as np
 
 from teaser_jax import synthetic
 from teaser_jax.ground.checks import whole_number
+from teaser_jax.pose import Pose
 from teaser_jax.studies import methods as m
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.peers import find_peers
 from teaser_jax.studies.trials import Draw, Model, StudyError, Trial, seed_of
 from teaser_jax.synthetic import SyntheticProblem
-from teaser_jax.pose import Pose
 
 OUTLIERS, OVERLAP, MATCHES = "outlier_rate", "overlap", "n"
 LABELS = {OUTLIERS: "wrong matches", OVERLAP: "overlap", MATCHES: "matches"}

@@ -13,22 +13,23 @@ import numpy as np
 from jax.sharding import Mesh
 
 from teaser_jax import metrics
-from teaser_jax.solve_batch import solve_batch
 from teaser_jax.certify.proof import CertifyMethod
 from teaser_jax.certify.rotation import certify_rotation
 from teaser_jax.profile import profile
 from teaser_jax.register import register
+from teaser_jax.solve_batch import solve_batch
 from teaser_jax.stages.refinement import fit_similarity
 from teaser_jax.stages.scale import estimate_scale
 from teaser_jax.stages.translation import estimate_translation
 from teaser_jax.studies.peers import Peer
 from teaser_jax.studies.trials import Trial
+
 CliqueMethod = RotationMethod = str
-from teaser_jax.stages.vote.sweep import Criterion
 from teaser_jax.pose import Pose
 from teaser_jax.settings import Settings
 from teaser_jax.solution import Solution, Status
 from teaser_jax.solve_rotation import RotationSolution, solve_rotation
+from teaser_jax.stages.vote.sweep import Criterion
 
 Row: TypeAlias = dict[str, Any]
 OURS = "teaser_jax"

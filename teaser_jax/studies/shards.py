@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from teaser_jax.files import FileError, read_archive, whole
+from teaser_jax.pose import Pose
 from teaser_jax.studies.catalogue import Study
 from teaser_jax.studies.trials import TEAPOT, Model, Trial, check_seed
 from teaser_jax.synthetic import SyntheticProblem
-from teaser_jax.pose import Pose
 
 SHARD_BYTES = 64_000_000
 SHAPES = {

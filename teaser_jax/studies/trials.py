@@ -10,10 +10,9 @@ from zlib import crc32
 
 import numpy as np
 
-from teaser_jax.ground.checks import whole_number
 from teaser_jax.files import FileError, one_line
-from teaser_jax.problem import Problem
-from teaser_jax.problem import host_problem
+from teaser_jax.ground.checks import whole_number
+from teaser_jax.problem import Problem, host_problem
 from teaser_jax.synthetic import Mesh, SyntheticProblem
 
 

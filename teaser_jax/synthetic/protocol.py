@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.synthetic.models import Mesh, Points, Seed, sample_model
 from teaser_jax.pose import Pose
+from teaser_jax.synthetic.models import Mesh, Points, Seed, sample_model
 
 SIGMA = 0.01
 BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimensions

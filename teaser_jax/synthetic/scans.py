@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from teaser_jax.pose import Pose
 from teaser_jax.synthetic.models import Points, Seed
 from teaser_jax.synthetic.protocol import random_rotation
-from teaser_jax.pose import Pose
 
 Vector = Float[np.ndarray, "3"]
 

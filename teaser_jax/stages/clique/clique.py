@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32
@@ -27,6 +27,7 @@ class Clique(NamedTuple):
         return self.members.sum(axis=-1, dtype=np.int32) >= self.upper_bound
 
 
+@runtime_checkable
 class CliqueMethod(Protocol):
     """A way to prune wrong matches. Its record holds its numbers, with their defaults.
 

@@ -41,7 +41,7 @@ _loading = threading.Lock()
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ExactClique:
-    """Find the maximum clique: greedy cliques on the device, then a search on the host where they prove nothing.
+    """Find the maximum clique: greedy cliques on the device, then a search on the host if they prove none.
 
     When a budget is spent, the best clique so far and the bound proved by then are returned.
 
@@ -323,7 +323,7 @@ def load_kernels() -> bool:
 
 
 def two_pentagons() -> UInt32[np.ndarray, "10 1"]:
-    """A graph that no bound settles before the search branches: two pentagons, each joined to all of the other.
+    """A graph that no bound settles before the search branches: two pentagons, joined vertex by vertex.
 
     Its largest cliques have 4 vertices, and it needs 6 colours.
     """

@@ -111,30 +111,32 @@ def degeneracy_order(rows):
 
 
 @compiled
-def grow_clique(rows, seed, share, clique):
-    """A greedy clique through ``seed`` into ``clique``; returns its size.
-
-    Starts from all neighbours and drops those that know fewest of the rest, the lowest ``share`` of
-    the range of degrees at a time, until all know each other; then takes in whoever fits.
-    """
-    n, width = rows.shape
+def neighbours(rows, vertex):
+    """The neighbours of a vertex, in order."""
+    width = rows.shape[1]
     m = 0
     for w in range(width):
-        m += np.int64(count_bits(rows[seed, w]))
+        m += np.int64(count_bits(rows[vertex, w]))
     vertices = np.empty(m, np.int64)
     m = 0
     for w in range(width):
-        rest = rows[seed, w]
+        rest = rows[vertex, w]
         while rest != ZERO:
             vertices[m] = 64 * w + np.int64(lowest_bit(rest))
             rest &= rest - ONE
             m += 1
-    sub = induced(rows, vertices)
-    short = sub.shape[1]
-    inside, going = np.zeros(short, np.uint64), np.zeros(short, np.uint64)
-    for i in range(m):
-        inside[i >> 6] |= ONE << np.uint64(i & 63)
-    degree, size = degrees(sub), m
+    return vertices
+
+
+@compiled
+def drop_strangers(rows, share, inside):
+    """Take vertices that know fewest of the rest out of ``inside`` until all know each other.
+
+    The lowest ``share`` of the range of degrees goes at a time; of equals, one.
+    """
+    m, width = rows.shape
+    going = np.zeros(width, np.uint64)
+    degree, size = degrees(rows), m
     while size > 0:
         lowest, highest = size, -1
         for i in range(m):
@@ -143,7 +145,7 @@ def grow_clique(rows, seed, share, clique):
         if lowest >= size - 1:
             break
         cut = lowest + np.int64(share * (highest - lowest))
-        alone = lowest == highest  # equals: one goes at a time
+        alone = lowest == highest
         going[:] = ZERO
         for i in range(m):
             if (inside[i >> 6] >> np.uint64(i & 63)) & ONE and degree[i] <= cut:
@@ -151,33 +153,49 @@ def grow_clique(rows, seed, share, clique):
                 size -= 1
                 if alone:
                     break
-        for w in range(short):
+        for w in range(width):
             inside[w] &= ~going[w]
-        for w in range(short):
+        for w in range(width):
             gone = going[w]
             while gone != ZERO:
                 i = 64 * w + np.int64(lowest_bit(gone))
                 gone &= gone - ONE
-                for x in range(short):
-                    left = sub[i, x] & inside[x]
+                for x in range(width):
+                    left = rows[i, x] & inside[x]
                     while left != ZERO:
                         degree[64 * x + np.int64(lowest_bit(left))] -= 1
                         left &= left - ONE
+
+
+@compiled
+def grow_clique(rows, seed, share, clique):
+    """A greedy clique through ``seed`` into ``clique``; returns its size.
+
+    Starts from all neighbours, drops those that know fewest of the rest until all know each other, then takes
+    in whoever fits.
+    """
+    vertices = neighbours(rows, seed)
+    sub, m = induced(rows, vertices), len(vertices)
+    width = sub.shape[1]
+    inside = np.zeros(width, np.uint64)
+    for i in range(m):
+        inside[i >> 6] |= ONE << np.uint64(i & 63)
+    drop_strangers(sub, share, inside)
     clique[0] = seed
     size = 1
-    fitting = np.full(short, ~ZERO, np.uint64)
+    fitting = np.full(width, ~ZERO, np.uint64)
     for i in range(m):
         if (inside[i >> 6] >> np.uint64(i & 63)) & ONE:
             clique[size] = vertices[i]
             size += 1
-            for w in range(short):
+            for w in range(width):
                 fitting[w] &= sub[i, w]
     for i in range(m):
         known = (inside[i >> 6] >> np.uint64(i & 63)) & ONE
         if not known and (fitting[i >> 6] >> np.uint64(i & 63)) & ONE:
             clique[size] = vertices[i]
             size += 1
-            for w in range(short):
+            for w in range(width):
                 fitting[w] &= sub[i, w]
     return size
 

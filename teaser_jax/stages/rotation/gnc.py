@@ -1,8 +1,8 @@
 """The rotation by graduated non-convexity on truncated least squares (section X, TEASER++).
 
-The cost (12) is softened by a control mu. At small mu it is nearly convex, so that the fit may start anywhere;
-as mu grows round by round it stiffens, until every TIM counts fully or not at all. Residuals are in units of
-their bounds throughout.
+The cost (12) is softened by a control mu. At small mu it is nearly convex, so that the fit may start
+anywhere; as mu grows round by round it stiffens, until every TIM counts fully or not at all. Residuals are in
+units of their bounds throughout.
 """
 
 from __future__ import annotations
@@ -92,7 +92,9 @@ def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: Float[Array, ""], dtype
 def gnc_weights(
     r2: Float[Array, "*k"], gnc_mu: Float[Array, ""], cbar2: Float[Array, ""]
 ) -> Float[Array, "*k"]:
-    """The weight of each measurement: 1 below mu/(mu+1) c^2, 0 above (mu+1)/mu c^2, and c sqrt(mu (mu+1)) / r - mu between.
+    """The weight of each measurement under a control mu.
+
+    It is 1 below mu/(mu+1) c^2, 0 above (mu+1)/mu c^2, and c sqrt(mu (mu+1)) / r - mu between.
 
     The derivative of ``gnc_cost`` by r^2.
 
@@ -108,7 +110,10 @@ def gnc_weights(
 
 
 def gnc_cost(r2: Float[Array, "*k"], gnc_mu: Float[Array, ""], cbar2: Float[Array, ""]) -> Float[Array, "*k"]:
-    """The softened cost of each measurement: r^2 below the first threshold, c^2 above the second, 2 c r sqrt(mu (mu+1)) - mu (c^2 + r^2) between.
+    """The softened cost of each measurement under a control mu.
+
+    It is r^2 below the first threshold of ``gnc_weights``, c^2 above the second, and
+    2 c r sqrt(mu (mu+1)) - mu (c^2 + r^2) between.
 
     Gradients: exact and continuous in r^2.
 

@@ -163,7 +163,10 @@ def correlation_of_pairs(
     confidence: Float[Array, " n"],
     chosen: UInt32[Array, "n w"],
 ) -> Float[Array, "3 3"]:
-    """The correlation H over the pairs that packed bit rows choose, weights c_i c_j / delta_ij^2. Gradients: exact."""
+    """The correlation H over the pairs that packed bit rows choose, with weights c_i c_j / delta_ij^2.
+
+    Gradients: exact.
+    """
 
     def add(total: Array, lane: Array, visited: PairSlice) -> Array:
         hit = bits.lane_of(chosen, lane) & visited.valid

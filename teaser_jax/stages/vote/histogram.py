@@ -11,7 +11,7 @@ those are sorted and swept. Memory does not grow with the number of measurements
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ MOST_PASSES = 24
 Measured = tuple[Float[Array, " k"], Float[Array, " k"], Bool[Array, " k"]]
 
 
+@runtime_checkable
 class MeasurementRows(Protocol):
     """Measurements row by row: values, bounds, and which of them vote."""
 
@@ -152,15 +153,25 @@ def vote_by_histogram(
         where=zero,
         passes=jnp.zeros((), jnp.int32),
     )
+    narrowed = _narrow(measurements, start, cbar2, interval)
+    best, witness = _sweep_open_bins(measurements, narrowed, cbar2, interval)
+    swept = best >= (1 - 1e-9) * narrowed.gain
+    return (best > 0) | (narrowed.gain > 0), jnp.where(swept, witness, narrowed.where)
 
-    room = most_ends(measurements.rows * measurements.length)
+
+def _narrow(
+    measurements: MeasurementRows, start: Question, cbar2: Array, interval: tuple[Any, Any]
+) -> Question:
+    """Pass over the measurements until the ends in the open bins are few enough to sweep."""
+    unit = start.axis.unit
+    zero, room = jnp.zeros_like(unit), most_ends(measurements.rows * measurements.length)
 
     def unsettled(q: Question) -> Bool[Array, ""]:
         first, last = q.hull()
         closer = (q.ends > room) & (4 * (last - first + 1) <= BINS) & (q.passes < MOST_PASSES)
         return (q.passes <= SAMPLE_PASSES) | closer
 
-    def narrow(q: Question) -> Question:
+    def once(q: Question) -> Question:
         # A sample goes where it sees most. With that place as the centre all are asked about the whole
         # axis, and then about what that leaves open.
         sampled, fresh = q.passes < SAMPLE_PASSES, q.passes == SAMPLE_PASSES
@@ -169,19 +180,27 @@ def vote_by_histogram(
         closer = q.axis.part(jnp.where(sampled, best, first), jnp.where(sampled, best, last))
         whole = Axis(zero, jnp.ones_like(unit), jnp.where(q.where > 0, q.where, unit))
         axis = jax.tree.map(partial(jnp.where, (q.passes == 0) | fresh), whole, closer)
-        asked = jnp.where(
-            sampled, min(measurements.rows, -(-SAMPLE // measurements.length)), measurements.rows
-        )
+        sample = min(measurements.rows, -(-SAMPLE // measurements.length))
+        asked = jnp.where(sampled, sample, measurements.rows)
         q = q._replace(axis=axis, centre=axis.middle(), gain=jnp.where(fresh, 0, q.gain))
         return _bounds(_histogram(measurements, asked, q, cbar2), q, cbar2, interval)
+
+    return lax.while_loop(unsettled, once, start)
+
+
+def _sweep_open_bins(
+    measurements: MeasurementRows, narrowed: Question, cbar2: Array, interval: tuple[Any, Any]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Sweep the open bins, some at a time: the best gain there, and a number with which its set agrees."""
+    zero, room = jnp.zeros_like(narrowed.gain), most_ends(measurements.rows * measurements.length)
 
     def remains(state: tuple[Question, Array, Array]) -> Bool[Array, ""]:
         return jnp.any(state[0].open)
 
-    def sweep(state: tuple[Question, Array, Array]) -> tuple[Question, Array, Array]:
+    def once(state: tuple[Question, Array, Array]) -> tuple[Question, Array, Array]:
         q, best, witness = state
         # As many of the open bins as there is room for, at least one.
-        ends = running_sums(jnp.where(q.open, q.touching, 0)[None].astype(unit.dtype))[0]
+        ends = running_sums(jnp.where(q.open, q.touching, 0)[None].astype(zero.dtype))[0]
         index = _counting(BINS + 2)
         first = jnp.min(jnp.where(q.open, index, BINS + 1))
         piece = q.open & ((ends <= room) | (index == first))
@@ -191,10 +210,8 @@ def vote_by_histogram(
         q = q._replace(upper=jnp.where(piece, -jnp.inf, q.upper), gain=jnp.maximum(q.gain, best))
         return q, best, witness
 
-    narrowed = lax.while_loop(unsettled, narrow, start)
-    _, best, witness = lax.while_loop(remains, sweep, (narrowed, zero, zero))
-    swept = best >= (1 - 1e-9) * narrowed.gain
-    return (best > 0) | (narrowed.gain > 0), jnp.where(swept, witness, narrowed.where)
+    _, best, witness = lax.while_loop(remains, once, (narrowed, zero, zero))
+    return best, witness
 
 
 def most_ends(count: int) -> int:

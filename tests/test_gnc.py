@@ -13,9 +13,9 @@ import pytest
 from oracles import in_ball, pack, random_matches, random_rotation, unpack
 
 from teaser_jax import so3
+from teaser_jax.stages.pairs import ring_pairs
+from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
 from teaser_jax.stages.rotation.tims import complete_tims, correlation, correlation_of_pairs, listed_tims
-from teaser_jax.stages.rotation.gnc import gnc_rotation as estimate_rotation
-from teaser_jax.stages.pairs import ring_pairs as ring_tims
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -44,10 +44,10 @@ def random_tims(seed: int, wrong: float, bound: float = 0.05) -> Measured:
 
 
 @partial(jax.jit, static_argnames="iterations")
-def estimate(src, dst, bounds, mask=None, cbar2=1.0, gnc_factor=1.4, iterations=100):
+def estimate(src, dst, bounds, mask=None, cbar2=1.0, factor=1.4, iterations=100):
     mask = jnp.ones(src.shape[0], bool) if mask is None else mask
     tims = listed_tims(src, dst, bounds, mask)
-    return estimate_rotation(tims, cbar2=cbar2, gnc_factor=gnc_factor, iterations=iterations, dtype=src.dtype)
+    return gnc_rotation(tims, Gnc(factor, iterations=iterations), cbar2=cbar2, dtype=src.dtype)
 
 
 def wahba(weights, src, dst) -> np.ndarray:
@@ -103,7 +103,7 @@ def test_truncation_and_factor_enter_as_in_the_formulas(cbar2, factor):
     for seed in range(5):
         data = random_tims(seed, 0.4)
         expected, members, _ = gnc_by_the_book(data, cbar2, factor, 100)
-        found = estimate(*data[:3], cbar2=cbar2, gnc_factor=factor)
+        found = estimate(*data[:3], cbar2=cbar2, factor=factor)
         np.testing.assert_allclose(found.rotation, expected, atol=1e-8)
         np.testing.assert_array_equal(found.members, members)
 
@@ -225,7 +225,7 @@ def test_correlation_of_packed_pairs_is_the_dense_sum():
 @pytest.mark.parametrize("members", [[], [4], [1, 6], [0, 2, 3], [5, 6, 7], range(8)], ids=str)
 def test_the_chain_is_a_closed_ring_in_the_users_order(members):
     clique = np.isin(np.arange(8), list(members))
-    pairs = np.asarray(ring_tims(jnp.asarray(clique)))
+    pairs = np.asarray(ring_pairs(jnp.asarray(clique)))
     np.testing.assert_array_equal(pairs[:, 0], np.arange(8))
     members = np.flatnonzero(clique)
     np.testing.assert_array_equal(pairs[members, 1], np.roll(members, -1))

@@ -16,10 +16,11 @@ import pytest
 from jax.sharding import Mesh
 
 import teaser_jax as tj
-from teaser_jax.engine.sizes import Size
-from teaser_jax.engine.programs import MOST
-from teaser_jax.engine.compaction import ALL_ROWS as NO_ROOM, rows_for as rooms
 from teaser_jax.engine.batch import Solver
+from teaser_jax.engine.compaction import ALL_ROWS as NO_ROOM
+from teaser_jax.engine.compaction import rows_for as rooms
+from teaser_jax.engine.programs import MOST
+from teaser_jax.engine.sizes import Size
 from teaser_jax.synthetic import random_problem
 
 HERE = Path(__file__).parent

@@ -9,11 +9,11 @@ import pytest
 from oracles import BOUND, best_rotation, draw_vectors, rotation_cost
 
 import teaser_jax as tj
-from teaser_jax.stages import rotation_global
+from teaser_jax.stages.rotation import pair_search
+from teaser_jax.stages.rotation.pair_search import pair_hypotheses, polish, search_pairs
 from teaser_jax.stages.rotation.quadratic_form import Measurements
-from teaser_jax.stages.rotation.pair_search import pair_hypotheses, polish, search_pairs as search
 
-found_by = jax.jit(search)
+found_by = jax.jit(search_pairs)
 
 
 def framed(src, dst, rotation=None) -> Measurements:
@@ -69,8 +69,8 @@ def test_masked_and_many_measurements(x64, monkeypatch):
     none = m._replace(mask=jnp.zeros(30, bool))
     np.testing.assert_allclose(found_by(none), np.eye(3), atol=1e-12)
     # With room for fewer hypotheses than pairs each measurement still takes part.
-    monkeypatch.setattr(rotation_global, "HYPOTHESES", 90)
-    assert jax.jit(lambda m: search(m))(m).shape == (3, 3)
+    monkeypatch.setattr(pair_search, "HYPOTHESES", 90)
+    assert jax.jit(lambda m: search_pairs(m))(m).shape == (3, 3)
 
 
 def test_in_the_cascade_it_changes_nothing_that_is_right(small):

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from oracles import random_matches, random_rotation
 
-from teaser_jax.stages import invariants
+from teaser_jax.ground import arrays, bits
+from teaser_jax.stages import pairs as pairs_room
 
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -29,14 +30,14 @@ def test_tims_are_the_incidence_matrix_times_the_points(graph):
     points = np.random.default_rng(0).normal(size=(12, 3))
     incidence = nx.incidence_matrix(graph, nodelist=range(12), oriented=True).toarray().T
     expected = np.kron(incidence, np.eye(3)) @ points.ravel()
-    found = invariants.tims(jnp.asarray(points), jnp.asarray(oriented_edges(graph)))
+    found = pairs_room.tims(jnp.asarray(points), jnp.asarray(oriented_edges(graph)))
     np.testing.assert_allclose(np.ravel(found), expected, atol=1e-15)
 
 
 def test_tim_bounds_add():
     bounds = np.array([0.1, 0.2, 0.4])
     np.testing.assert_allclose(
-        invariants.tim_bounds(jnp.asarray(bounds), jnp.array([[0, 1], [2, 1]])), [0.3, 0.6]
+        pairs_room.tim_bounds(jnp.asarray(bounds), jnp.array([[0, 1], [2, 1]])), [0.3, 0.6]
     )
 
 
@@ -44,19 +45,19 @@ def test_tims_forget_translation_and_trims_rotation_too():
     matches = random_matches(0, n=12, wrong=0)
     pairs = jnp.asarray(oriented_edges(nx.complete_graph(12)))
     bounds = jnp.ones(len(pairs))
-    a = invariants.tims(jnp.asarray(matches.src), pairs)
-    np.testing.assert_allclose(invariants.tims(jnp.asarray(matches.src + 7), pairs), a, atol=1e-14)
+    a = pairs_room.tims(jnp.asarray(matches.src), pairs)
+    np.testing.assert_allclose(pairs_room.tims(jnp.asarray(matches.src + 7), pairs), a, atol=1e-14)
     turn = random_rotation(np.random.default_rng(1))
-    turned, _ = invariants.trims(a, a @ turn.T * 1.7, bounds)
+    turned, _ = pairs_room.trims(a, a @ turn.T * 1.7, bounds)
     np.testing.assert_allclose(turned, 1.7, atol=1e-14)
 
 
 def test_trims_of_right_matches_lie_within_their_bounds():
     matches = random_matches(3, n=30, wrong=0, scale=1.6)
     pairs = jnp.asarray(oriented_edges(nx.complete_graph(30)))
-    a, b = (invariants.tims(jnp.asarray(x), pairs) for x in (matches.src, matches.dst))
-    delta = invariants.tim_bounds(jnp.full(30, matches.noise_bound), pairs)
-    values, bounds = invariants.trims(a, b, delta)
+    a, b = (pairs_room.tims(jnp.asarray(x), pairs) for x in (matches.src, matches.dst))
+    delta = pairs_room.tim_bounds(jnp.full(30, matches.noise_bound), pairs)
+    values, bounds = pairs_room.trims(a, b, delta)
     np.testing.assert_allclose(bounds, np.asarray(delta) / np.linalg.norm(a, axis=1))
     assert np.all(np.abs(np.asarray(values) - 1.6) <= np.asarray(bounds))
     assert np.any(np.abs(np.asarray(values) - 1.6) > 0.2 * np.asarray(bounds))
@@ -66,12 +67,12 @@ def test_zero_length_pairs_cannot_vote_and_have_no_gradient():
     a = jnp.array([[0.0, 0, 0], [3, 0, 4], [0, 0, 0], [0, 2, 0]])
     b = jnp.array([[1.0, 0, 0], [0, 5, 0], [0, 0, 0], [0, 0, 0]])
     delta = jnp.full(4, 0.1)
-    values, bounds = invariants.trims(a, b, delta)
+    values, bounds = pairs_room.trims(a, b, delta)
     np.testing.assert_allclose(values, [0, 1, 0, 0])
     np.testing.assert_allclose(bounds, [np.inf, 0.02, np.inf, 0.05])
 
     def total(a, b):
-        values, bounds = invariants.trims(a, b, delta)
+        values, bounds = pairs_room.trims(a, b, delta)
         return jnp.sum(values) + jnp.sum(jnp.where(jnp.isfinite(bounds), bounds, 0))
 
     da, db = jax.grad(total, argnums=(0, 1))(a, b)
@@ -85,12 +86,12 @@ def test_zero_length_pairs_cannot_vote_and_have_no_gradient():
 
 
 def test_lengths_and_roots_are_flat_at_zero():
-    assert jax.value_and_grad(invariants.safe_sqrt)(0.0) == (0, 0)
-    assert jax.value_and_grad(invariants.safe_sqrt)(4.0) == (2, 0.25)
-    length, slope = jax.value_and_grad(invariants.safe_norm)(jnp.zeros(3))
+    assert jax.value_and_grad(arrays.safe_sqrt)(0.0) == (0, 0)
+    assert jax.value_and_grad(arrays.safe_sqrt)(4.0) == (2, 0.25)
+    length, slope = jax.value_and_grad(arrays.safe_norm)(jnp.zeros(3))
     assert length == 0
     assert np.all(np.asarray(slope) == 0)
-    np.testing.assert_allclose(jax.grad(invariants.safe_norm)(jnp.array([3.0, 0, 4])), [0.6, 0, 0.8])
+    np.testing.assert_allclose(jax.grad(arrays.safe_norm)(jnp.array([3.0, 0, 4])), [0.6, 0, 0.8])
 
 
 @pytest.mark.parametrize("n", SIZES)
@@ -100,10 +101,10 @@ def test_fold_meets_each_ordered_pair_of_usable_matches_once(n):
     mask = rng.uniform(size=n) < 0.8
 
     def mark(met, lane, visited):
-        columns = jnp.arange(invariants.words(n)) * 32 + lane
+        columns = jnp.arange(bits.words(n)) * 32 + lane
         return met.at[:, columns].add(jnp.where(visited.valid, 1, 0), mode="drop")
 
-    met = invariants.fold_pairs(
+    met = pairs_room.fold_pairs(
         mark, jnp.zeros((n, n), int), *(jnp.asarray(x) for x in (src, dst, beta, mask))
     )
     np.testing.assert_array_equal(met, mask[:, None] & mask & ~np.eye(n, dtype=bool))
@@ -115,11 +116,11 @@ def test_fold_hands_out_the_tims_and_bounds_of_the_dense_graph(n):
     src, dst, beta = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.uniform(1, 2, n)
 
     def collect(dense, lane, visited):
-        columns = jnp.arange(invariants.words(n)) * 32 + lane
+        columns = jnp.arange(bits.words(n)) * 32 + lane
         layers = [*visited.src_tims, *visited.dst_tims, visited.bounds]
         return dense.at[:, :, columns].set(jnp.where(visited.valid, jnp.stack(layers), 0), mode="drop")
 
-    found = invariants.fold_pairs(
+    found = pairs_room.fold_pairs(
         collect, jnp.zeros((7, n, n)), *(jnp.asarray(x) for x in (src, dst, beta)), jnp.ones(n, bool)
     )
     off = ~np.eye(n, dtype=bool)
@@ -142,10 +143,10 @@ def test_gradient_through_the_fold_is_the_dense_one(n):
 
     def folded(src, dst, beta):
         def add(total, _, visited):
-            a2, b2 = invariants.squared_norm(visited.src_tims), invariants.squared_norm(visited.dst_tims)
+            a2, b2 = pairs_room.squared_norm(visited.src_tims), pairs_room.squared_norm(visited.dst_tims)
             return total + jnp.sum(jnp.where(visited.valid, term(a2, b2, visited.bounds), 0))
 
-        return invariants.fold_pairs(add, jnp.zeros(()), src, dst, beta, mask)
+        return pairs_room.fold_pairs(add, jnp.zeros(()), src, dst, beta, mask)
 
     def dense(src, dst, beta):
         square = lambda x: jnp.sum((x[:, None] - x[None]) ** 2, axis=-1)
@@ -160,4 +161,4 @@ def test_gradient_through_the_fold_is_the_dense_one(n):
 
 @pytest.mark.parametrize(("n", "expected"), [(0, 0), (1, 1), (32, 1), (33, 2), (64, 2)])
 def test_words(n, expected):
-    assert invariants.words(n) == expected
+    assert bits.words(n) == expected

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import teaser_jax as tj
-from teaser_jax.stages import trust
+from teaser_jax.settings import ExactClique, Refinement, ScaleVote
+from teaser_jax.stages import verdict
 from teaser_jax.synthetic import random_problem, random_rotation
 
 BOUND = 0.05
@@ -83,7 +84,7 @@ def test_the_first_failure_sticks():
 
 def test_an_iteration_cap_is_reported():
     problem = random_problem(3, n=60, outlier_rate=0.5)
-    capped = tj.Settings(refine_iterations=1)
+    capped = tj.Settings(refine=Refinement(iterations=1))
     full = tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound)
     found = tj.register(problem.src, problem.dst, noise_bound=problem.noise_bound, settings=capped)
     assert full.ok
@@ -92,7 +93,7 @@ def test_an_iteration_cap_is_reported():
 
 
 def test_turns_are_rotations_far_from_none_and_spread():
-    turns = trust.TURNS
+    turns = verdict.TURNS
     assert len(turns) >= 60
     np.testing.assert_allclose(
         np.swapaxes(turns, 1, 2) @ turns, np.broadcast_to(np.eye(3), turns.shape), atol=1e-12
@@ -109,7 +110,7 @@ def test_inliers_that_huddle_count_as_chance(x64):
     src = np.concatenate([0.01 * cloud(40), 5 + cloud(24)])
     problem = tj.make_problem(src, src, noise_bound=BOUND)
     pose = tj.Pose(np.eye(3), np.zeros(3), np.ones(()))
-    counts = np.asarray(trust.chance_inliers(problem, pose, np.arange(n) < 40))
+    counts = np.asarray(verdict.chance_inliers(problem, pose, np.arange(n) < 40))
     assert counts.min() == 39
 
 
@@ -121,7 +122,7 @@ def test_copies_of_a_match_are_no_evidence(seed):
     # Thirty wrong matches, each listed sixteen times: three of them that agree look like 48.
     rng = np.random.default_rng(seed)
     src, dst = (np.repeat(rng.uniform(-1, 1, (30, 3)), 16, axis=0) for _ in range(2))
-    assert status(src, dst, settings=tj.Settings(clique_seconds=1.0)) != tj.Status.OK
+    assert status(src, dst, settings=tj.Settings(clique=ExactClique(seconds=1.0))) != tj.Status.OK
 
 
 def test_copies_do_no_harm_either():
@@ -137,7 +138,7 @@ def test_repeats_are_the_later_copies(n, x64):
     rng = np.random.default_rng(n)
     rows = rng.normal(size=(n, 6))[rng.integers(0, (n + 1) // 2, n)]
     problem = tj.make_problem(rows[:, :3], rows[:, 3:], noise_bound=1.0)
-    found = np.asarray(trust.repeats(problem))
+    found = np.asarray(verdict.repeats(problem))
     _, first = np.unique(rows, axis=0, return_index=True)
     later = ~np.isin(np.arange(n), first)
     assert not found[~later].any()
@@ -162,7 +163,7 @@ def test_a_scale_out_of_its_range_has_no_consensus():
         (1.2, 1.5): tj.Status.NO_CONSENSUS,
         (2.0, 3.0): tj.Status.NO_CONSENSUS,
     }.items():
-        settings = tj.Settings(scale_range=scale_range)
+        settings = tj.Settings(scale_search=ScaleVote(scale_range))
         assert status(problem.src, problem.dst, settings=settings, **known) == expected
 
 

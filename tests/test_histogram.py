@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from oracles import random_matches, set_cost, tls_by_enumeration, tls_cost, unpack
 
-from teaser_jax.stages import histogram_voting, scale
+from teaser_jax.stages import scale
+from teaser_jax.stages.vote import histogram
 from teaser_jax.stages.vote.histogram import vote_by_histogram
 from teaser_jax.stages.vote.sweep import vote
 
@@ -22,10 +23,10 @@ LENGTH = 16  # measurements in a row
 @pytest.fixture(params=[(256, 256), (64, 128)], ids=["256 bins", "64 bins"])
 def few_bins(request, monkeypatch):
     bins, ends = request.param
-    monkeypatch.setattr(histogram_voting, "BINS", bins)
+    monkeypatch.setattr(histogram, "BINS", bins)
     passes = math.ceil(math.log(1e8, bins))  # as sharp an eye as the many bins give
-    monkeypatch.setattr(histogram_voting, "SAMPLE_PASSES", passes)
-    monkeypatch.setattr(histogram_voting, "most_ends", lambda count: ends)
+    monkeypatch.setattr(histogram, "SAMPLE_PASSES", passes)
+    monkeypatch.setattr(histogram, "most_ends", lambda count: ends)
     by_histogram.clear_cache()
     yield
     by_histogram.clear_cache()
