@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.packing import pack_problem
 from teaser_jax.problem import finite_rows, is_traced, pad_problem
 from teaser_jax.register import (

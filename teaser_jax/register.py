@@ -15,7 +15,7 @@ from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import compile_ahead
 from teaser_jax.certify.pose import MAX_TRACED
 from teaser_jax.certify.pose import certify as certify_pose
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.compilation import OLDER_EMITTERS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.packing import (
     PackedProblem,

@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.solve import check_records, solve, usable_rows
 from teaser_jax.stages.gnc import gnc_cost, gnc_weights

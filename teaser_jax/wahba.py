@@ -32,7 +32,7 @@ from teaser_jax.certify.rotation import (
     check_tolerance,
     default_iterations,
 )  # fmt: skip
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.stages.quadratic_form import in_frame_of

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "teaser_jax"
 
 # In the order of the data. A module may import from lines above it, and from its own line downwards never.
 ORDER = [
-    "checks", "so3", "types",
+    "ground.arrays", "ground.checks", "ground.loops", "ground.io", "so3", "types",
     "stages.invariants", "stages.bits", "stages.voting", "stages.histogram_voting", "stages.scale",
     "stages.consistency",
     "stages.clique_reduction", "stages.clique_branching", "stages.clique", "stages.clique_search",

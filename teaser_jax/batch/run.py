@@ -29,7 +29,7 @@ from teaser_jax.batch.groups import (
 )
 from teaser_jax.batch.processes import all_of, check_agreement, local_mesh, share
 from teaser_jax.batch.programs import Programs, platform, programs, rooms, unit
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.packing import PackedProblem, choices_of, pack_problem, unpack_solution
 from teaser_jax.register import check_settings, with_origins, without_padding
 from teaser_jax.solve import Graph

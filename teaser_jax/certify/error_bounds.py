@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.pose import certify
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.solve import cascade_pose
 from teaser_jax.types import Pose, Problem, Solution

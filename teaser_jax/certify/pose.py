@@ -24,7 +24,7 @@ from teaser_jax.certify.rotation import (
     default_iterations,
 )  # fmt: skip
 from teaser_jax.certify.stack import certify_stack
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.solve import cascade_pose, usable_rows

@@ -20,7 +20,7 @@ from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import certify_rows, compacted
 from teaser_jax.certify.proof import CertifyMethod, prove
 from teaser_jax.certify.stack import certify_stack
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import is_traced
 from teaser_jax.so3 import AnyArray
 from teaser_jax.stages.quadratic_form import in_frame_of

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from teaser_jax import synthetic
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.studies import methods as m
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.peers import find_peers

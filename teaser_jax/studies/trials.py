@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from teaser_jax.checks import whole_number
+from teaser_jax.ground.checks import whole_number
 from teaser_jax.files import FileError, one_line
 from teaser_jax.problem import Problem
 from teaser_jax.register import host_problem

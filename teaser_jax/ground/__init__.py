@@ -1,0 +1,1 @@
+"""What every other room stands on: arrays, packed bits, checks of arguments, loops, files."""

@@ -1,0 +1,83 @@
+"""Arrays of numpy and of JAX alike: which of the two, what can be known of them, how they are read."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+# numpy's on the host, JAX's on the device, and while JAX rebuilds records also its placeholders: shapes and
+# dtypes without numbers, axes of vmap, whatever `jax.tree.map` returned.
+AnyArray: TypeAlias = Any
+
+CONCRETE = (np.ndarray, float, int, type(None))
+
+
+def namespace(*arrays: object) -> ModuleType:
+    """``jax.numpy`` if any array is JAX's (tracers included), ``numpy`` otherwise.
+
+    Host results stay float64 although JAX may run with 64-bit types switched off.
+    """
+    return jnp if any(isinstance(a, jax.Array) for a in arrays) else np
+
+
+def is_traced(*values: Any) -> bool:
+    """Whether any leaf of the values is a tracer, so that its number is not known."""
+    unclear = [x for x in values if not isinstance(x, CONCRETE)]
+    return bool(unclear) and any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
+
+
+def inside_jit() -> bool:
+    """Whether this code runs while JAX traces a program, so that even constants become tracers."""
+    return isinstance(jnp.zeros(()), jax.core.Tracer)
+
+
+def rounded_product(a: Array, b: Array) -> Array:
+    """The product a b, rounded before anything is added to it.
+
+    Compilers fuse a product and a sum where their vectors happen to allow it, so that the last bit
+    would depend on the place in a batch. A comparison between the two prevents that; a reduction of
+    precision to what it is already, a barrier and a cast to bits are all optimised away.
+
+    Gradients: exact.
+    """
+    product = a * b
+    return jnp.maximum(product, jnp.finfo(product.dtype).min)
+
+
+def as_numpy(value: Any, name: str) -> np.ndarray:
+    """A numpy view or copy of anything with ``__array__`` or ``__dlpack__``, or of nested lists.
+
+    Args:
+        value: What the user gave.
+        name: The name of the argument, for the error.
+
+    Raises:
+        ValueError: If the value is missing or cannot be read as an array.
+    """
+    if value is None:
+        raise ValueError(f"{name} is missing: None was given where numbers are needed.")
+    try:
+        if isinstance(value, np.ma.MaskedArray):
+            return _without_hidden(value)
+        if hasattr(value, "__dlpack__") and not hasattr(value, "__array__"):
+            return np.from_dlpack(value)
+        return np.asarray(value)
+    except (TypeError, ValueError, RuntimeError, BufferError) as error:
+        raise ValueError(
+            f"{name} cannot be read as an array ({type(value).__name__}: {error}). Give an array on "
+            "the host, or anything with __array__ or __dlpack__."
+        ) from error
+
+
+def _without_hidden(array: np.ma.MaskedArray) -> np.ndarray:
+    """What is hidden must not come back as a number: it becomes NaN, or False among truth values."""
+    if not np.ma.is_masked(array):
+        return array.data
+    if array.dtype.kind == "b":
+        return array.filled(False)
+    return np.ma.filled(array.astype(np.float64) if array.dtype.kind in "iu" else array, np.nan)

@@ -1,0 +1,52 @@
+"""What arguments must be, said in the same words everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from numbers import Integral
+from typing import Any
+
+BELOW = 2**31  # counts are 32-bit numbers on a device
+
+
+def whole_number(
+    name: str,
+    value: Any,
+    least: int,
+    *,
+    below: int | None = BELOW,
+    what: str = "a whole number",
+    error: type[ValueError] = ValueError,
+) -> int:
+    """Check an argument that counts something, and return it as an int.
+
+    Args:
+        name: The name of the argument.
+        value: What was received; numpy's integers are welcome, True and False are not.
+        least: The smallest number that makes sense.
+        below: All numbers that make sense lie below this one; None: there is no end.
+        what: What the argument is, in the words of the error.
+        error: The kind of error to raise.
+
+    Raises:
+        ValueError: Or ``error``, if the value is no whole number, or out of range.
+    """
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise error(f"{name} is {value!r}: expected {what}, {least} or above.")
+    if below is not None and int(value) >= below:
+        raise error(f"{name} is {value!r}: expected {what} below {below}.")
+    return int(value)
+
+
+def one_of(name: str, value: Any, allowed: Iterable[Any], *, expected: str = "one of") -> None:
+    """Raise ValueError unless a value is among the allowed ones, which the error lists.
+
+    Args:
+        name: The name of the argument.
+        value: What was received.
+        allowed: What makes sense.
+        expected: The words before the list.
+    """
+    listed = list(allowed)
+    if not any(value is known or (isinstance(value, str) and value == known) for known in listed):
+        raise ValueError(f"{name} is {value!r}: expected {expected} {', '.join(map(repr, listed))}.")

@@ -1,0 +1,72 @@
+"""Files: read without trust, written whole or not at all, and what is wrong said in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ZIP = (b"PK\x03\x04", b"PK\x05\x06")  # how archives begin, full and empty ones
+
+
+class FileError(ValueError):
+    """A file that cannot be used. The message is one line: what is wrong and what to do."""
+
+
+def one_line(message: object, limit: int = 300) -> str:
+    """A message without line breaks and of bearable length."""
+    text = "".join(c if c.isprintable() else " " for c in str(message))
+    text = " ".join(text.split())
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A place to write, which becomes ``path`` at the end; after a failure ``path`` is as before."""
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_archive(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` by name.
+
+    Raises:
+        FileError: If the file is no archive, or is broken.
+        OSError: If it cannot be read.
+    """
+    return or_file_error(path, "is no .npz archive, or is broken", lambda: _arrays(path))
+
+
+def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
+    """What ``read`` returns; whatever it raises, but OSError, becomes a FileError that says ``what``.
+
+    Broken files make zipfile, zlib, struct, ast and numpy raise nearly anything, in every
+    version something else: so everything is caught here, and nowhere else.
+    """
+    try:
+        return read()
+    except OSError:
+        raise
+    except Exception as error:
+        reason = one_line(error) or type(error).__name__
+        raise FileError(f"{path}: {what} ({reason}).") from error
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    # numpy closes only files that it did not open; pickled objects would run code from the file.
+    with path.open("rb") as file:
+        start = file.read(6)
+        if start == b"\x93NUMPY":
+            raise ValueError("one array without a name")
+        if not start.startswith(ZIP):  # numpy would take it for a pickle and advise to trust it
+            raise ValueError("it does not begin as a zip file does")
+        file.seek(0)
+        archive = np.load(file, allow_pickle=False)
+        return {name: archive[name] for name in archive.files}
