@@ -24,7 +24,7 @@ from teaser_jax.stages.translation import estimate_translation
 from teaser_jax.studies.peers import Peer
 from teaser_jax.studies.trials import Trial
 from teaser_jax.types import CliqueMethod, Criterion, Pose, RotationMethod, Settings, Solution, Status
-from teaser_jax.wahba import RotationSolution, solve_rotation
+from teaser_jax.solve_rotation import RotationSolution, solve_rotation
 
 Row: TypeAlias = dict[str, Any]
 OURS = "teaser_jax"
