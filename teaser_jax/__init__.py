@@ -12,9 +12,9 @@ from teaser_jax.profile import Profile, profile
 from teaser_jax.register import Registration, host_problem, register, warmup
 from teaser_jax.soft import SoftSolution, soft_solve
 from teaser_jax.solve import refit, select, solve
+from teaser_jax.solve_rotation import RotationSolution, solve_rotation
 from teaser_jax.types import Pose, Problem, Selection, Settings, Solution, Status
 from teaser_jax.uncertainty import Uncertainty, covariance, pose_difference
-from teaser_jax.solve_rotation import RotationSolution, solve_rotation
 
 __version__ = "0.1.0"
 

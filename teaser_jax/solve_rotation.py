@@ -73,7 +73,6 @@ class RotationSolution:
         return f"RotationSolution({found}, {self.certificate!r})"
 
 
-# Longer than other functions: the docstring of a public door says all about its arguments.
 def solve_rotation(
     src: Any,
     dst: Any,

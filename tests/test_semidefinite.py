@@ -1,4 +1,4 @@
-"""Eigenvalues: the projection on the cone, the smallest one beside padding, and what one factorisation proves."""
+"""Eigenvalues: the projection on the cone, the smallest one beside padding, what a factorisation proves."""
 
 from __future__ import annotations
 

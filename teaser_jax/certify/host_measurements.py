@@ -81,6 +81,6 @@ def without_padding(measurements: HostMeasurements) -> HostMeasurements:
 
 
 def padded_size(k: int) -> int:
-    """The size of the programs that serve k measurements: an eighth more at most, sixteen at least."""
+    """Round k up to the size of the program that serves it: an eighth more at most, sixteen at least."""
     step = max(8, 1 << max((k - 1).bit_length() - 3, 0))
     return max(16, -(-k // step) * step)

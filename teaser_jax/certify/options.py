@@ -35,7 +35,7 @@ class Options(NamedTuple):
     max_measurements: int
 
     def rounds(self, k: int) -> int:
-        """The cap on rounds of the splitting for k measurements."""
+        """Cap the rounds of the splitting for k measurements."""
         return default_iterations(k) if self.iterations is None else self.iterations
 
 
@@ -55,7 +55,7 @@ def checked_options(
 
 
 def default_iterations(k: int) -> int:
-    """How many rounds of the splitting on k measurements cost what 200 rounds on 200 do."""
+    """Count the rounds of the splitting that cost on k measurements what 200 rounds cost on 200."""
     return ITERATIONS if k <= AFFORDABLE else max(3, round(ITERATIONS * (AFFORDABLE / k) ** 3))
 
 

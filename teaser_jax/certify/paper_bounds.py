@@ -78,7 +78,7 @@ def paper_bounds(inliers: InlierSet) -> PaperBounds:
 
 
 def _largest_alpha(inliers: InlierSet) -> float:
-    """The largest alpha_ij = (c beta_i + c beta_j) / |a_i - a_j| of all pairs [-]."""
+    """Find the largest alpha_ij = (c beta_i + c beta_j) / |a_i - a_j| of all pairs [-]."""
     a, beta = inliers.src, inliers.bounds
     largest = 0.0
     for i in range(len(a) - 1):
@@ -89,7 +89,7 @@ def _largest_alpha(inliers: InlierSet) -> float:
 
 
 def flattest_four(points: Float[np.ndarray, "m 3"]) -> float:
-    """The smallest singular value of U over all (i; j, h, k): unit vectors from point i to three others.
+    """Find the smallest singular value of U over all (i; j, h, k): unit vectors from point i to three others.
 
     Exact. With unit columns the two larger singular values multiply to 3/2 at most, so none is below
     2/3 of the determinant, and only those that could be smallest are decomposed.
@@ -159,7 +159,7 @@ def contracts(
 
 
 def _no_three_on_a_line(points: Float[np.ndarray, "m 3"]) -> bool | None:
-    """Whether no three points are on a line; None where there are too many to look at all."""
+    """Check that no three points are on a line; None where there are too many to look at all."""
     if len(points) > MAX_TRIPLES:
         return None
     for i in range(len(points)):

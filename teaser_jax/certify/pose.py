@@ -28,7 +28,6 @@ MAX_TRACED = 128  # measurements under jit, where sizes are static
 Records = TypeVar("Records")
 
 
-# Longer than other functions: the docstring of a public door says all about its arguments.
 def certify(
     problem: Problem,
     solution: Solution,

@@ -105,7 +105,7 @@ def _stack_on_host(
 
 
 def _checked_shape(src: Any, dst: Any, rotation: Any) -> tuple[int, ...]:
-    """The shape of the vectors, (k, 3) or (b, k, 3); ValueError if the others do not fit it."""
+    """Return the shape of the vectors, (k, 3) or (b, k, 3); ValueError if the others do not fit it."""
     a, b, r = np.shape(src), np.shape(dst), np.shape(rotation)
     if any(np.iscomplexobj(x) for x in (src, dst, rotation) if not is_traced(x)):
         raise ValueError("src, dst and rotation are real; complex numbers were received.")

@@ -106,7 +106,7 @@ def _about_tims(problem: Problem, solution: Solution, about: About, members: int
 
 
 def _most_members(about: About, most: int) -> int:
-    """How many members of the clique have at most so many TIMs."""
+    """Count the members of a clique that has at most so many TIMs."""
     return int((1 + np.sqrt(1 + 8 * most)) // 2) if about == "complete" else most
 
 

@@ -38,7 +38,7 @@ class WholeSet:
     inliers: InlierSet
 
     def at(self, points: Float[np.ndarray, "p 3"] | Float[np.ndarray, " 3"]) -> Float[np.ndarray, " p"]:
-        """How far each source point can be from where the other pose takes it [length of the target]."""
+        """Bound how far each source point can be from where the other pose takes it [length of the dst]."""
         return _displacement(self.inliers, np.atleast_2d(np.asarray(points, np.float64)), self.wrong)
 
     @property
@@ -88,7 +88,7 @@ def whole_set(inliers: InlierSet, wrong: int) -> WholeSet:
 
 
 def _spread2(inliers: InlierSet, wrong: int) -> Float[np.ndarray, " 3"]:
-    """Squared singular values of the centred inliers, ascending, if the worst ``wrong`` are taken out.
+    """Bound the squared singular values of the centred inliers, ascending, without the worst ``wrong``.
 
     Taking points out of a scatter matrix lowers no eigenvalue by more than the squares of their distances
     from the centre, and what the centre moves.
@@ -101,12 +101,12 @@ def _spread2(inliers: InlierSet, wrong: int) -> Float[np.ndarray, " 3"]:
 
 
 def _furthest2(inliers: InlierSet, count: int) -> float:
-    """The sum of the ``count`` largest squared distances from the centre."""
+    """Add the ``count`` largest squared distances from the centre."""
     return float(np.sort(np.sum(inliers.centred**2, axis=1))[::-1][:count].sum())
 
 
 def _moved(inliers: InlierSet, wrong: int) -> float:
-    """A bound on |D A|_F, how far the centred inliers are moved altogether."""
+    """Bound |D A|_F, by how much the centred inliers are moved altogether."""
     noise = np.linalg.norm(inliers.bounds)
     if wrong > 0:
         return float(noise + np.linalg.norm(inliers.residuals))

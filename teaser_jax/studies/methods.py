@@ -18,13 +18,13 @@ from teaser_jax.certify.proof import CertifyMethod
 from teaser_jax.certify.rotation import certify_rotation
 from teaser_jax.profile import profile
 from teaser_jax.register import register
+from teaser_jax.solve_rotation import RotationSolution, solve_rotation
 from teaser_jax.stages.refinement import fit_similarity
 from teaser_jax.stages.scale import estimate_scale
 from teaser_jax.stages.translation import estimate_translation
 from teaser_jax.studies.peers import Peer
 from teaser_jax.studies.trials import Trial
 from teaser_jax.types import CliqueMethod, Criterion, Pose, RotationMethod, Settings, Solution, Status
-from teaser_jax.solve_rotation import RotationSolution, solve_rotation
 
 Row: TypeAlias = dict[str, Any]
 OURS = "teaser_jax"
