@@ -73,14 +73,31 @@ class Settings:
         one_of("Settings.vote", self.vote, get_args(Criterion))
         one_of("Settings.tim_graph", self.tim_graph, get_args(TimGraph))
         for name, known in (("scale_search", SCALES), ("clique", CLIQUES), ("rotation", ROTATIONS)):
-            choice = getattr(self, name)
-            if isinstance(choice, str):  # anything else is a record, or a placeholder of JAX
-                one_of(f"Settings.{name}", choice, known)
-                object.__setattr__(self, name, known[choice]())
+            object.__setattr__(self, name, as_record(f"Settings.{name}", getattr(self, name), known))
         if isinstance(self.refine, str):
             one_of("Settings.refine", self.refine, (True, False))
         if isinstance(self.refine, bool):
             object.__setattr__(self, "refine", Refinement() if self.refine else None)
+
+
+def as_record(name: str, choice: Any, known: dict[str, Any]) -> Any:
+    """The record that a name stands for; anything else is a record, or a placeholder of JAX, and passes.
+
+    Raises:
+        ValueError: If the name is unknown.
+    """
+    if not isinstance(choice, str):
+        return choice
+    one_of(name, choice, known)
+    return known[choice]()
+
+
+def check_record(name: str, record: Any, known: dict[str, Any]) -> None:
+    """Check that a choice is one of the known records, and that its numbers are known. Raises ValueError."""
+    if not isinstance(record, tuple(known.values())):
+        one_of(name, record, known)
+    check_concrete(record)
+    check_concrete(getattr(record, "gnc", record))
 
 
 def check_settings(settings: Any) -> None:
@@ -92,11 +109,7 @@ def check_settings(settings: Any) -> None:
     if not isinstance(settings, Settings):
         raise ValueError(f"settings is {settings!r}: expected Settings, as in Settings(clique='greedy').")
     for name, known in (("scale_search", SCALES), ("clique", CLIQUES), ("rotation", ROTATIONS)):
-        record = getattr(settings, name)
-        if not isinstance(record, tuple(known.values())):
-            one_of(f"Settings.{name}", record, known)
-        check_concrete(record)
+        check_record(f"Settings.{name}", getattr(settings, name), known)
     if not isinstance(settings.refine, Refinement | None):
         one_of("Settings.refine", settings.refine, (True, False))
-    check_concrete(getattr(settings.rotation, "gnc", settings.rotation))
     settings.scale_search.check_concrete()

@@ -9,43 +9,34 @@ Each ends in a certificate: what is proved of the rotation, and not what the met
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate
-from teaser_jax.certify.host import QUICKLY, Rows, at_once, certify_rows, compacted
-from teaser_jax.certify.proof import CertifyMethod
+from teaser_jax.certify.host import QUICKLY, certify_on_host, in_float64
+from teaser_jax.certify.host_measurements import HostMeasurements, read_measurements
+from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.relaxation import relaxed_rotation
-from teaser_jax.certify.rotation import (
-    MAX_MEASUREMENTS,
-    TOLERANCE,
-    as_mask,
-    certify_rotation,
-    check_tolerance,
-    default_iterations,
-)
+from teaser_jax.certify.traced import certify_traced, traced_mask
 from teaser_jax.ground.arrays import AnyArray, is_traced
-from teaser_jax.ground.checks import whole_number
-from teaser_jax.stages.rotation.gnc import gnc_rotation
-from teaser_jax.stages.rotation.pair_search import search_pairs as search
+from teaser_jax.ground.checks import one_of
+from teaser_jax.settings import ROTATIONS, RotationMethod, as_record, check_record
+from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
+from teaser_jax.stages.rotation.pair_search import search_pairs
 from teaser_jax.stages.rotation.quadratic_form import in_frame_of
-from teaser_jax.stages.rotation.relaxation import RelaxationReport as Relaxation
+from teaser_jax.stages.rotation.relaxation import RelaxationReport
 from teaser_jax.stages.rotation.tims import listed_tims
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=["rotation", "inliers", "cost", "certificate"],
-    meta_fields=["relaxation"],
-)
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, repr=False)
 class RotationSolution:
     """The answer of ``solve_rotation``.
@@ -58,11 +49,11 @@ class RotationSolution:
         relaxation: What the conic solver said, for ``method="sdp"``.
     """
 
-    rotation: Float[AnyArray, "3 3"]
-    inliers: Bool[AnyArray, " k"]
-    cost: Float[AnyArray, ""]
+    rotation: Float[AnyArray, "*batch 3 3"]
+    inliers: Bool[AnyArray, "*batch k"]
+    cost: Float[AnyArray, "*batch"]
     certificate: Certificate | None = None
-    relaxation: Relaxation | None = None
+    relaxation: RelaxationReport | None = field(default=None, metadata=dict(static=True))
 
     def __repr__(self) -> str:
         if isinstance(self.cost, jax.core.Tracer) or np.shape(self.cost) != ():
@@ -74,23 +65,24 @@ class RotationSolution:
 
 
 def solve_rotation(
-    src: Float[AnyArray, "k 3"],
-    dst: Float[AnyArray, "k 3"],
+    src: Any,
+    dst: Any,
     *,
     noise_bound: Any,
-    method: Any = "global",
+    method: RotationMethod | str = "global",
     cbar2: Any = 1.0,
-    mask: Bool[AnyArray, " k"] | None = None,
+    mask: Any = None,
     proof: CertifyMethod | None = "splitting",
     tolerance: Any = TOLERANCE,
     iterations: int | None = None,
 ) -> RotationSolution:
-    """The rotation behind vector pairs ``dst_k ~ R src_k``, many of them wrong, and what is proved of it.
+    """Find the rotation behind vector pairs ``dst_k ~ R src_k``, many of them wrong, and prove what can be.
 
     Args:
-        src, dst: Vectors, row k with row k [length]; rows that are not finite are left out.
+        src, dst: (k, 3) vectors, row k with row k [length]; rows that are not finite are left out.
         noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length].
-        method: ``"gnc"``, ``"global"`` or ``"sdp"``; the last needs the extra ``sdp``, runs outside jit only
+        method: ``"gnc"``, ``"global"`` or ``"sdp"``, or the record that one of them stands for
+            (``teaser_jax.settings.Gnc``, ``PairSearch``, ``Relaxation``); the last needs the extra ``sdp``, runs outside jit only
             and takes up to 100 measurements: 2, 8 and 50 seconds for 20, 30 and 50.
         cbar2: Truncation, c-bar squared [-].
         mask: (k,) rows to use.
@@ -112,85 +104,114 @@ def solve_rotation(
     References: Yang, Shi, Carlone, T-RO 2020, section VIII, (12), (19), (23), Theorem 13; GNC: Yang,
     Antonante, Tzoumas, Carlone, RA-L 2020.
     """
-    if method not in ("gnc", "global", "sdp"):
-        raise ValueError(f"method is {method!r}: expected 'gnc', 'global' or 'sdp'.")
-    if proof not in (None, "splitting", "direct", "reference"):
-        raise ValueError(f"proof is {proof!r}: expected 'splitting', 'direct', 'reference' or None.")
+    method = as_record("method", method, ROTATIONS)
+    check_record("method", method, ROTATIONS)
+    one_of("proof", proof, (*get_args(CertifyMethod), None))
+    _check_vectors(src, dst)
+    options = checked_options(tolerance, iterations, proof or "splitting", MAX_MEASUREMENTS)
+    mask = np.ones(np.shape(src)[0], bool) if mask is None else mask
+    known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
+    how = _traced if is_traced(src, dst, known, tolerance) else _on_host
+    return how(src, dst, **known, method=method, options=options, certified=proof is not None)
+
+
+def _check_vectors(src: Any, dst: Any) -> None:
+    """Raise ValueError unless the vectors are (k, 3) both, and real."""
     if np.shape(src) != np.shape(dst) or np.ndim(src) != 2 or np.shape(src)[1] != 3:
         raise ValueError(
             f"src and dst have shapes {np.shape(src)} and {np.shape(dst)}: expected (k, 3) both, rows are "
             "measurements."
         )
-    k = np.shape(src)[0]
-    mask = np.ones(k, bool) if mask is None else mask
-    rounds = default_iterations(k) if iterations is None else whole_number("iterations", iterations, 0)
     if any(np.iscomplexobj(x) for x in (src, dst) if not is_traced(x)):
         raise ValueError("src and dst are real; complex numbers were received.")
-    if is_traced(src, dst, noise_bound, cbar2, mask, tolerance):
-        mask = as_mask(mask, (k,))
-        # Rows of zeros that are masked: programs want something to look at.
-        grown = (0, max(0, 2 - k))
-        src, dst = (jnp.pad(jnp.asarray(x), (grown, (0, 0))) for x in (src, dst))
-        src, dst = (x.astype(jnp.promote_types(x.dtype, jnp.float32)) for x in (src, dst))
-        noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
-        mask = jnp.pad(mask, grown)
-        if method == "sdp":
-            raise ValueError("method='sdp' calls a conic solver and runs outside jit only: take 'global'.")
-        src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
-        found = _search(src, dst, noise_bound, cbar2, mask, method=method)
-        if proof is not None:
-            certificate = certify_rotation(
-                src, dst, found.rotation,
-                noise_bound=noise_bound, cbar2=cbar2, mask=mask, tolerance=tolerance, iterations=rounds,
-                method=proof,
-            )  # fmt: skip
-            found = replace(found, certificate=certificate)
-        return replace(found, inliers=found.inliers[:k])
-    rows, tolerance = compacted(src, dst, noise_bound, cbar2, mask), check_tolerance(tolerance)
-    found = at_once(lambda: jax.device_get(_compiled(rows, method="gnc" if method == "gnc" else "global")))
-    if method == "sdp":
-        found = _by_relaxation(rows, found, tolerance, proof, rounds)
-    elif proof is not None:
-        certificate = certify_rows(
-            rows, found.rotation, tolerance, iterations=rounds, method=proof, most=MAX_MEASUREMENTS
-        )
+
+
+def _traced(
+    src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any,
+    method: RotationMethod, options: Options, certified: bool,
+) -> RotationSolution:  # fmt: skip
+    """Solve in the program that is being traced."""
+    if method.needs_host:
+        raise ValueError("method='sdp' calls a conic solver and runs outside jit only: take 'global'.")
+    k = np.shape(src)[0]
+    # Rows of zeros that are masked: programs want something to look at.
+    grown = (0, max(0, 2 - k))
+    mask = jnp.pad(traced_mask(mask, (k,)), grown)
+    src, dst = (jnp.pad(jnp.asarray(x), (grown, (0, 0))) for x in (src, dst))
+    src, dst = (x.astype(jnp.promote_types(x.dtype, jnp.float32)) for x in (src, dst))
+    noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
+    src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
+    found = _search(src, dst, noise_bound, cbar2, mask, _gnc_of(method), all_pairs=_tries_pairs(method))
+    if certified:
+        certificate = certify_traced(
+            src, dst, found.rotation,
+            noise_bound=noise_bound, cbar2=cbar2, mask=mask, options=options, rounds=options.rounds(k),
+        )  # fmt: skip
+        found = replace(found, certificate=certificate)
+    return replace(found, inliers=found.inliers[:k])
+
+
+def _on_host(
+    src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any,
+    method: RotationMethod, options: Options, certified: bool,
+) -> RotationSolution:  # fmt: skip
+    """Solve outside jit, in float64."""
+    k = np.shape(src)[0]
+    measurements = read_measurements(src, dst, noise_bound, cbar2, mask)
+    rounds = options.rounds(k)
+    gnc, all_pairs = _gnc_of(method), _tries_pairs(method)
+    found = in_float64(lambda: jax.device_get(_searched(measurements, gnc, all_pairs=all_pairs)))
+    if method.needs_host:
+        found = _by_relaxation(measurements, found, options, rounds=rounds, certified=certified)
+    elif certified:
+        certificate = certify_on_host(measurements, found.rotation, options, rounds=rounds)
         found = replace(found, certificate=certificate)
     inliers = np.zeros(k, bool)
-    inliers[np.flatnonzero(mask)] = found.inliers[: int(rows.mask.sum())]
+    inliers[np.flatnonzero(mask)] = found.inliers[: measurements.measured]
     return replace(found, inliers=inliers)
 
 
-@partial(jax.jit, static_argnames="method", compiler_options=QUICKLY)
-def _compiled(rows: Rows, *, method: Literal["gnc", "global"]) -> RotationSolution:
-    return _search(**rows._asdict(), method=method)
+def _gnc_of(method: RotationMethod) -> Gnc:
+    """How graduated non-convexity goes, with which every method begins."""
+    return method if isinstance(method, Gnc) else method.gnc
+
+
+def _tries_pairs(method: RotationMethod) -> bool:
+    """Whether a method goes on to search all pairs of measurements."""
+    return not isinstance(method, Gnc)
+
+
+@partial(jax.jit, static_argnames="all_pairs", compiler_options=QUICKLY)
+def _searched(measurements: HostMeasurements, gnc: Gnc, *, all_pairs: bool) -> RotationSolution:
+    """Search in one compiled program."""
+    return _search(**measurements._asdict(), gnc=gnc, all_pairs=all_pairs)
 
 
 def _search(
-    src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: Any, *, method: Literal["gnc", "global"]
-) -> RotationSolution:
-    src, dst = jnp.asarray(src), jnp.asarray(dst)
+    src: Float[Array, "k 3"], dst: Float[Array, "k 3"], noise_bound: Any, cbar2: Any, mask: Any,
+    gnc: Gnc, *, all_pairs: bool,
+) -> RotationSolution:  # fmt: skip
+    """Find a rotation by graduated non-convexity, and a better one if pairs of measurements know of one."""
     dtype, eye = src.dtype, jnp.eye(3, dtype=src.dtype)
     m, _, constant = in_frame_of(eye, src, dst, noise_bound=noise_bound, cbar2=cbar2, mask=mask, dtype=dtype)
-    tims = listed_tims(m.src, m.dst, jnp.ones(len(m.src), dtype), m.mask)
-    rotation = gnc_rotation(tims, cbar2=m.cbar2, dtype=dtype).rotation
-    if method == "global":
-        rotation = jnp.matmul(rotation, search(m.turned(rotation)), precision=lax.Precision.HIGHEST)
+    listed = listed_tims(m.src, m.dst, jnp.ones(len(m.src), dtype), m.mask)
+    rotation = gnc_rotation(listed, gnc, cbar2=m.cbar2, dtype=dtype).rotation
+    if all_pairs:
+        rotation = jnp.matmul(rotation, search_pairs(m.turned(rotation)), precision=lax.Precision.HIGHEST)
     r2 = jnp.sum((dst - so3.rotate(rotation, src)) ** 2, axis=1)
-    return RotationSolution(
-        rotation, mask & (r2 <= cbar2 * noise_bound**2), m.turned(rotation).cost + constant
-    )
+    inliers = mask & (r2 <= cbar2 * noise_bound**2)
+    return RotationSolution(rotation, inliers, m.turned(rotation).cost + constant)
 
 
 def _by_relaxation(
-    rows: Rows, start: RotationSolution, tolerance: float, proof: CertifyMethod | None, rounds: int
+    measurements: HostMeasurements, start: RotationSolution, options: Options, *, rounds: int, certified: bool
 ) -> RotationSolution:
-    found = relaxed_rotation(rows, start.rotation, tolerance)
-    certificate = found.certificate if proof is not None else None
-    if certificate is not None and proof is not None and not certificate.is_optimal:
-        other = certify_rows(
-            rows, found.rotation, tolerance, iterations=rounds, method=proof, most=MAX_MEASUREMENTS
-        )
+    """Solve the relaxation from a good rotation; of its own certificate and ours the better one counts."""
+    found = relaxed_rotation(measurements, start.rotation, float(options.tolerance))
+    certificate = found.certificate if certified else None
+    if certificate is not None and not certificate.is_optimal:
+        other = certify_on_host(measurements, found.rotation, options, rounds=rounds)
         certificate = min(certificate, other, key=lambda c: (not c.is_optimal, float(c.suboptimality)))
-    r2 = np.sum((rows.dst - rows.src @ found.rotation.T) ** 2, axis=1)
-    inliers = rows.mask & (r2 <= rows.cbar2 * rows.noise_bound**2)
+    r2 = np.sum((measurements.dst - measurements.src @ found.rotation.T) ** 2, axis=1)
+    inliers = measurements.mask & (r2 <= measurements.cbar2 * measurements.noise_bound**2)
     return RotationSolution(found.rotation, inliers, np.float64(found.cost), certificate, found.relaxation)

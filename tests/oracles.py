@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import combinations
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -204,6 +205,11 @@ def draw_vectors(
     odd = rng.normal(size=(len(bad), 3))
     dst[bad] = odd * (np.linalg.norm(src[bad], axis=1) / np.linalg.norm(odd, axis=1))[:, None]
     return src, dst, rotation
+
+
+def tampered(certificate, **claims) -> SimpleNamespace:
+    """What has the fields of a certificate and claims something else, which the record itself may refuse."""
+    return SimpleNamespace(**{**vars(certificate), **claims})
 
 
 def turned(rotation: np.ndarray, degrees: float, seed=0) -> np.ndarray:

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from oracles import BOUND, best_rotation, draw_vectors, rotation_cost, turned
+from oracles import BOUND, best_rotation, draw_vectors, rotation_cost, tampered, turned
 
 from teaser_jax import CertificateStatus, CertifiedBy, certify_rotation, verify
 
@@ -283,8 +283,6 @@ def test_too_large_ones_say_what_they_cost():
 
 
 def test_malformed_certificates_are_refuted_and_never_raise():
-    from dataclasses import replace
-
     src, dst, rotation = draw_vectors(2, 12, 0.2)
     best = certify_rotation(src, dst, rotation, noise_bound=BOUND).rotation
     good = certify_rotation(src, dst, best, noise_bound=BOUND)
@@ -295,21 +293,21 @@ def test_malformed_certificates_are_refuted_and_never_raise():
     skew, diagonal = good.dual
     for odd in (
         None,
-        replace(good, dual=None),
-        replace(good, lower_bound=None),
-        replace(good, dual=(skew[:3, :3], diagonal)),
-        replace(good, dual=(diagonal, skew)),
-        replace(good, dual=(skew, diagonal[:, :3, :3])),
-        replace(good, rotation=np.eye(2)),
-        replace(good, measurements=99),
-        replace(good, absolute_gap=0.0),
-        replace(good, suboptimality=np.inf),
-        replace(good, lower_bound=-5.0, suboptimality=9.0),
-        replace(good, status=2),
+        tampered(good, dual=None),
+        tampered(good, lower_bound=None),
+        tampered(good, dual=(skew[:3, :3], diagonal)),
+        tampered(good, dual=(diagonal, skew)),
+        tampered(good, dual=(skew, diagonal[:, :3, :3])),
+        tampered(good, rotation=np.eye(2)),
+        tampered(good, measurements=99),
+        tampered(good, absolute_gap=0.0),
+        tampered(good, suboptimality=np.inf),
+        tampered(good, lower_bound=-5.0, suboptimality=9.0),
+        tampered(good, status=2),
     ):
         assert not verify(src, dst, best, odd, **known)
     for claims in (dict(is_optimal=True, status=0), dict(is_optimal=True)):
-        assert not verify(src, dst, turned(best, 20), replace(bad, **claims), **known)
+        assert not verify(src, dst, turned(best, 20), tampered(bad, **claims), **known)
     assert not verify(src, dst, best, good, noise_bound=-BOUND)
     assert not verify(src, dst, np.full((3, 3), np.nan), good, **known)
     with pytest.raises(ValueError, match="do not fit"):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import numpy as np
 import pytest
-from oracles import BOUND, draw_vectors, rotation_cost, turned
+from oracles import BOUND, draw_vectors, rotation_cost, tampered, turned
 
 import teaser_jax as tj
 from teaser_jax import CertificateStatus, certify_rotation, verify
@@ -60,7 +58,7 @@ def false_claims(k: int, rate: float, count: int, bound: float = BOUND, **how) -
         if one.is_optimal:
             made += 1
             wrong += not verify(src[i], dst[i], given[i], one, noise_bound=bound)
-            beyond = replace(one, lower_bound=np.float64(least * (1 + 1e-6) + 1e-9))
+            beyond = tampered(one, lower_bound=np.float64(least * (1 + 1e-6) + 1e-9))
             wrong += verify(src[i], dst[i], given[i], beyond, noise_bound=bound) and least > 1e-3
         else:
             wrong += one.status == CertificateStatus.OPTIMAL

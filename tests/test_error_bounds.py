@@ -11,7 +11,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import teaser_jax as tj
-from teaser_jax.certify.error_bounds import flattest_four
+from teaser_jax.certify.paper_bounds import flattest_four
 
 
 def registered(seed, n=100, outlier_rate=0.5, scale=1.0, **known):

@@ -93,7 +93,7 @@ def test_few_measurements_give_an_answer_and_no_crash(k):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (dict(method="ransac"), "expected 'gnc', 'global' or 'sdp'"),
+        (dict(method="ransac"), "expected one of 'gnc', 'global', 'sdp'"),
         (dict(src=np.ones((4, 2))), "expected \\(k, 3\\) both"),
         (dict(noise_bound=0.0), "above 0"),
         (dict(noise_bound=np.ones(3)), "shapes"),

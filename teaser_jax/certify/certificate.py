@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from functools import partial
 
 import jax
 import numpy as np
@@ -26,7 +25,7 @@ class CertificateStatus(enum.IntEnum):
 
     @property
     def advice(self) -> str:
-        """One sentence: what is proved, and what to try."""
+        """One sentence that says what is proved, and what to try."""
         return _ADVICE[self]
 
 
@@ -51,7 +50,7 @@ _ADVICE = {
 
 
 class CertifiedBy(enum.IntEnum):
-    """How the bound was found."""
+    """How the lower bound of a certificate was found. Held as int32 inside JAX."""
 
     NOTHING = 0
     ZERO_COST = 1
@@ -61,35 +60,31 @@ class CertifiedBy(enum.IntEnum):
     RELAXATION = 5
 
 
-@partial(
-    jax.tree_util.register_dataclass,
-    data_fields=[
-        "cost", "lower_bound", "suboptimality", "absolute_gap", "is_optimal", "is_unique", "angle_bound",
-        "measurements", "iterations", "method", "status", "rotation", "angle", "dual", "inlier_gap",
-        "explained_gap",
-    ],
-    meta_fields=[],
-)  # fmt: skip
+@jax.tree_util.register_dataclass
 @dataclass(frozen=True, repr=False)
 class Certificate:
     """What is proved of a rotation, given its measurements. False until proved.
 
+    Fields are numpy's where the certificate was made on the host and JAX's under jit; of a stack of problems
+    each has a leading axis.
+
     Attributes:
         cost: Truncated least squares cost of the rotation that was given [-].
         lower_bound: No rotation costs less: proved [-].
-        suboptimality: (cost - lower_bound) / cost; at most this share could be saved [-]. What was proved,
-            most of the time just the tolerance; 0 where the cost is below a millionth of c-bar squared.
-        absolute_gap: The same difference over the cost of calling everything an outlier [-].
+        suboptimality: (cost - lower_bound) / cost: no rotation saves more than this share [-]. It is what
+            was proved, most of the time just the tolerance; 0 where the cost is below a millionth of c-bar
+            squared.
+        absolute_gap: cost - lower_bound over the cost of calling everything an outlier [-].
         is_optimal: Whether the suboptimality is within the tolerance, or the gap below a millionth of c-bar
             squared: relative gaps of costs near zero say nothing.
         is_unique: Whether no other rotation costs as little as the polished one.
         angle_bound: Every rotation that costs no more lies within this angle; infinite: none follows [rad].
-        measurements: How many it is about; those of no length, which no rotation changes, are not counted.
+        measurements: How many were certified; those of no length, which no rotation changes, are not counted.
         iterations: Rounds of the splitting, or of the conic solver.
         method: A ``CertifiedBy`` as int32.
         status: A ``CertificateStatus`` as int32.
-        rotation: The given rotation, polished: least squares on its own inliers.
-        angle: Between the given rotation and the polished one [rad].
+        rotation: The given rotation after polishing, which makes it least squares on its own inliers.
+        angle: How far the polished rotation lies from the given one [rad].
         dual: The proof: with the measurements and ``rotation`` it can be checked by ``verify``.
         inlier_gap: No pose explains more than so many matches beyond this one's; None without a clique.
         explained_gap: (cost - cost of a pose that explains as many as the clique's bound allows, with no
@@ -97,22 +92,22 @@ class Certificate:
             clique.
     """
 
-    cost: Float[AnyArray, ""]
-    lower_bound: Float[AnyArray, ""]
-    suboptimality: Float[AnyArray, ""]
-    absolute_gap: Float[AnyArray, ""]
-    is_optimal: Bool[AnyArray, ""]
-    is_unique: Bool[AnyArray, ""]
-    angle_bound: Float[AnyArray, ""]
-    measurements: Int[AnyArray, ""]
-    iterations: Int[AnyArray, ""]
-    method: Int[AnyArray, ""]
-    status: Int[AnyArray, ""]
-    rotation: Float[AnyArray, "3 3"]
-    angle: Float[AnyArray, ""]
+    cost: Float[AnyArray, "*batch"]
+    lower_bound: Float[AnyArray, "*batch"]
+    suboptimality: Float[AnyArray, "*batch"]
+    absolute_gap: Float[AnyArray, "*batch"]
+    is_optimal: Bool[AnyArray, "*batch"]
+    is_unique: Bool[AnyArray, "*batch"]
+    angle_bound: Float[AnyArray, "*batch"]
+    measurements: Int[AnyArray, "*batch"]
+    iterations: Int[AnyArray, "*batch"]
+    method: Int[AnyArray, "*batch"]
+    status: Int[AnyArray, "*batch"]
+    rotation: Float[AnyArray, "*batch 3 3"]
+    angle: Float[AnyArray, "*batch"]
     dual: Dual
-    inlier_gap: Int[AnyArray, ""] | None = None
-    explained_gap: Float[AnyArray, ""] | None = None
+    inlier_gap: Int[AnyArray, "*batch"] | None = None
+    explained_gap: Float[AnyArray, "*batch"] | None = None
 
     def __repr__(self) -> str:
         if isinstance(self.status, jax.core.Tracer) or np.shape(self.status) != ():

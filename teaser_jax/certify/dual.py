@@ -32,12 +32,17 @@ class Dual(NamedTuple):
         diagonal: Blocks (k, k) of the measurements, symmetric. Block (0, 0) is minus their sum.
     """
 
-    skew: Float[AnyArray, "n n 6"]
-    diagonal: Float[AnyArray, "k 4 4"]
+    skew: Float[AnyArray, "*batch n n 6"]
+    diagonal: Float[AnyArray, "*batch k 4 4"]
+
+
+def existing(m: Measurements) -> Float[Array, " n"]:
+    """Write 1 for the block of the quaternion and those of measurements that exist, and 0 for padding."""
+    return jnp.concatenate([jnp.ones(1, m.src.dtype), m.mask.astype(m.src.dtype)])
 
 
 def dual_matrix(m: Measurements, dual: Dual) -> Float[Array, "n4 n4"]:
-    """M = Q - mu J + Delta."""
+    """Build M = Q - mu J + Delta from the free numbers of Delta."""
     n = dual.skew.shape[0]
     upper = jnp.where(jnp.triu(jnp.ones((n, n), bool), 1)[:, :, None], dual.skew, 0)
     skew = upper - jnp.swapaxes(upper, 0, 1)
@@ -54,7 +59,7 @@ def dual_matrix(m: Measurements, dual: Dual) -> Float[Array, "n4 n4"]:
 
 
 def dual_of(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Dual:
-    """The free numbers of a matrix M of the family; what does not belong to it is dropped."""
+    """Read the free numbers of a matrix M of the family; what does not belong to it is dropped."""
     n = matrix.shape[0] // 4
     blocks = (matrix - cost_matrix(m)).reshape(n, 4, n, 4)
     skew = 0.5 * (blocks - jnp.transpose(blocks, (0, 3, 2, 1)))
@@ -65,7 +70,7 @@ def dual_of(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Dual:
 
 
 def reference_guess(m: Measurements) -> Dual:
-    """The published initial guess: no coupling between measurements.
+    """Make the published initial guess, which has no coupling between measurements.
 
     References: Yang, Shi, Carlone, T-RO 2020, Algorithm 3 and its supplement.
     """
@@ -77,7 +82,7 @@ def reference_guess(m: Measurements) -> Dual:
 
 
 def coupled_guess(m: Measurements, *, correct_outliers: bool | Bool[Array, ""]) -> Dual:
-    """The torque of each residual, routed through the pairs of inliers.
+    """Route the torque of each residual through the pairs of inliers, a guess that often is a proof.
 
     For inliers j and k the last column of block (j, k) is beta_jk a_j x a_k with beta_jk = p_j . a_k +
     p_k . a_j, such that the sum over k is minus half the torque of residual j. It is orthogonal to both, so
@@ -102,6 +107,7 @@ def coupled_guess(m: Measurements, *, correct_outliers: bool | Bool[Array, ""]) 
 
 
 def _no_coupling(m: Measurements) -> Float[Array, "n n 6"]:
+    """Fill the skew blocks with zeros: measurements do not act on each other."""
     n = m.src.shape[0] + 1
     return jnp.zeros((n, n, 6), m.src.dtype)
 
@@ -109,7 +115,7 @@ def _no_coupling(m: Measurements) -> Float[Array, "n n 6"]:
 def _with_last_column(
     m: Measurements, top: Float[Array, "k 3 3"], minus: Float[Array, "k 4 4"]
 ) -> Float[Array, "k 4 4"]:
-    """Blocks (k, k) of M whose last column makes up for that of block (0, k): M x = 0."""
+    """Complete blocks (k, k) of M by a last column that makes up for that of block (0, k): M x = 0."""
     theta = jnp.where(m.inliers, 1, -1).astype(top.dtype)
     column = -0.5 * theta[:, None] * minus[:, :, 3]
     rows = jnp.concatenate([top, column[:, :3, None]], axis=2)
@@ -117,7 +123,7 @@ def _with_last_column(
 
 
 def _coupling(m: Measurements) -> Float[Array, "k k 3"]:
-    """y_jk of ``coupled_guess``."""
+    """Find the last columns y_jk of the blocks between inliers in ``coupled_guess``."""
     inlier = m.inliers[:, None].astype(m.src.dtype)
     a, xi = m.src * inlier, m.residuals * inlier
     eye = jnp.eye(3, dtype=a.dtype)
@@ -142,21 +148,22 @@ def _coupling(m: Measurements) -> Float[Array, "k k 3"]:
 
 
 def _outlier_correction(m: Measurements) -> Float[Array, "k 3 3"]:
-    """What replaces c^2 I / 2 in the block of an outlier: n n^T + m m^T / sin^2(phi / 2), times c^2 / 2.
+    """Find what turns c^2 I / 2 in the block of an outlier into (n n^T + p p^T / sin^2(phi / 2)) c^2 / 2.
 
-    n halves the angle phi between the two vectors and m is normal to both.
+    n halves the angle phi between the two vectors and p is normal to both. For all others it is zero.
     """
     eye = jnp.eye(3, dtype=m.src.dtype)
 
-    def unit(x: Array) -> tuple[Array, Array]:
+    def directions(x: Array) -> tuple[Array, Array]:
+        """Unit vectors along the rows, and which rows are long enough to have one."""
         length = jnp.sqrt(jnp.sum(x * x, axis=1))
         some = length > 1e-6
         return x / jnp.where(some, length, 1)[:, None], some
 
-    (a, some_a), (b, some_b) = unit(m.src), unit(m.dst)
-    (bisector, some_n), (normal, some_m) = unit(a + b), unit(jnp.cross(a, b))
+    (a, some_a), (b, some_b) = directions(m.src), directions(m.dst)
+    (bisector, some_n), (normal, some_p) = directions(a + b), directions(jnp.cross(a, b))
     sine2 = jnp.maximum(0.5 * (1 - jnp.sum(a * b, axis=1)), 1e-3)
     shape = bisector[:, :, None] * bisector[:, None, :]
     shape += normal[:, :, None] * normal[:, None, :] / sine2[:, None, None]
-    good = m.mask & ~m.inliers & some_a & some_b & some_n & some_m
+    good = m.mask & ~m.inliers & some_a & some_b & some_n & some_p
     return jnp.where(good[:, None, None], 0.5 * m.cbar2 * (shape - eye), 0)

@@ -1,50 +1,32 @@
-"""A certificate for the answer to a registration problem: which measurements it speaks about."""
+"""A certificate for the answer to a registration problem, and what the clique says of all poses."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from types import ModuleType
-from typing import Any, Literal, NamedTuple
+from typing import Any, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from teaser_jax.certify.certificate import Certificate, CertificateStatus
-from teaser_jax.certify.host import certify_rows, compacted
-from teaser_jax.certify.proof import CertifyMethod
-from teaser_jax.certify.rotation import (
-    MAX_MEASUREMENTS,
-    TOLERANCE,
-    certify_rotation,
-    check_tolerance,
-    default_iterations,
-)
+from teaser_jax.certify.host import certify_on_host
+from teaser_jax.certify.host_measurements import read_measurements
+from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.stack import certify_stack
-from teaser_jax.ground import bits
+from teaser_jax.certify.subject import About, subject_on_host, traced_subject
+from teaser_jax.certify.traced import certify_traced
 from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
-from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.checks import one_of
+from teaser_jax.problem import clean
 from teaser_jax.problem import Problem
-from teaser_jax.problem import clean as usable_rows
-from teaser_jax.refit import cascade_pose
 from teaser_jax.solution import Solution
-from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
 
 MAX_TRACED = 128  # measurements under jit, where sizes are static
 
-About = Literal["pose", "chain", "complete"]
-
-
-class Vectors(NamedTuple):
-    """What a rotation is certified against, and the rotation."""
-
-    src: Float[AnyArray, "k 3"]
-    dst: Float[AnyArray, "k 3"]
-    noise_bound: Float[AnyArray, " k"]
-    mask: Bool[AnyArray, " k"]
-    rotation: Float[AnyArray, "3 3"]
+Records = TypeVar("Records")
 
 
 def certify(
@@ -85,40 +67,60 @@ def certify(
 
     References: section VIII-C; for the gaps Theorem 6.
     """
-    if about not in ("pose", "chain", "complete"):
-        raise ValueError(f"about is {about!r}: expected 'pose', 'chain' or 'complete'.")
-    if method not in ("splitting", "direct", "reference"):
-        raise ValueError(f"method is {method!r}: expected 'splitting', 'direct' or 'reference'.")
-    if iterations is not None:
-        whole_number("iterations", iterations, 0)
-    if max_measurements is not None:
-        whole_number("max_measurements", max_measurements, 0)
-    if is_traced(problem, solution):
-        if np.ndim(solution.status) != 0:
-            raise ValueError("the solution is a stack: inside jit use jax.vmap(certify).")
-        most = MAX_TRACED if max_measurements is None else max_measurements
-        rounds = default_iterations(most) if iterations is None else iterations
-        known = dict(tolerance=tolerance, iterations=rounds, method=method, max_measurements=most)
-        return _traced(*lax.stop_gradient((problem, solution)), about, known)
-    most = MAX_MEASUREMENTS if max_measurements is None else max_measurements
-    problem, solution = jax.tree.map(_on_host, (problem, solution))
-    if np.ndim(solution.status) == 0:
-        items = [(problem, solution)]
-    else:
-        count = len(solution.status)
-        if np.ndim(problem.cbar2) != 1 or len(problem.cbar2) != count or count == 0:
-            raise ValueError("problem and solution are not stacks of the same length.")
-        items = [jax.tree.map(lambda x, i=i: x[i], (problem, solution)) for i in range(count)]
-    vectors = [_host_measurements(p, s, about) for p, s in items]
-    rows = [compacted(*v[:3], p.cbar2, v.mask) for v, (p, _) in zip(vectors, items, strict=True)]
-    if iterations is None:
-        iterations = default_iterations(max(int(r.mask.sum()) for r in rows))
-    known = dict(iterations=iterations, method=method, most=most)
-    if np.ndim(solution.status) == 0:
-        found = certify_rows(rows[0], vectors[0].rotation, check_tolerance(tolerance), **known)
-        return with_gaps(found, problem, solution)
-    rotations = np.stack([v.rotation for v in vectors])
-    found = certify_stack(rows, rotations, check_tolerance(tolerance), **known)
+    one_of("about", about, get_args(About))
+    one_of("method", method, get_args(CertifyMethod))
+    traced = is_traced(problem, solution)
+    if max_measurements is None:
+        max_measurements = MAX_TRACED if traced else MAX_MEASUREMENTS
+    options = checked_options(tolerance, iterations, method, max_measurements)
+    if traced:
+        return _traced(problem, solution, about, options)
+    problem, solution = on_host((problem, solution))
+    how = _on_host if np.ndim(solution.status) == 0 else _stack_on_host
+    return how(problem, solution, about, options)
+
+
+def _traced(problem: Problem, solution: Solution, about: About, options: Options) -> Certificate:
+    """Certify one answer in the program that is being traced."""
+    if np.ndim(solution.status) != 0:
+        raise ValueError("the solution is a stack: inside jit use jax.vmap(certify).")
+    problem, solution = lax.stop_gradient((problem, solution))
+    p, _ = clean(problem)
+    most = options.max_measurements
+    subject, too_many = traced_subject(p, solution, about, most)
+    found = certify_traced(
+        subject.src, subject.dst, subject.rotation,
+        noise_bound=subject.noise_bound, cbar2=problem.cbar2, mask=subject.mask,
+        options=options, rounds=options.rounds(most),
+    )  # fmt: skip
+    return with_gaps(_nothing_proved_where(too_many, found), p, solution)
+
+
+def _on_host(problem: Problem, solution: Solution, about: About, options: Options) -> Certificate:
+    """Certify one answer outside jit."""
+    subject = subject_on_host(problem, solution, about)
+    measurements = read_measurements(
+        subject.src, subject.dst, subject.noise_bound, problem.cbar2, subject.mask
+    )
+    rounds = options.rounds(measurements.measured)
+    found = certify_on_host(measurements, subject.rotation, options, rounds=rounds)
+    return with_gaps(found, problem, solution)
+
+
+def _stack_on_host(problem: Problem, solution: Solution, about: About, options: Options) -> Certificate:
+    """Certify a stack of answers outside jit."""
+    count = len(solution.status)
+    if np.ndim(problem.cbar2) != 1 or len(problem.cbar2) != count or count == 0:
+        raise ValueError("problem and solution are not stacks of the same length.")
+    items = [jax.tree.map(lambda x, i=i: x[i], (problem, solution)) for i in range(count)]
+    subjects = [subject_on_host(p, s, about) for p, s in items]
+    measurements = [
+        read_measurements(subject.src, subject.dst, subject.noise_bound, p.cbar2, subject.mask)
+        for subject, (p, _) in zip(subjects, items, strict=True)
+    ]
+    rotations = np.stack([subject.rotation for subject in subjects])
+    rounds = options.rounds(max(m.measured for m in measurements))
+    found = certify_stack(measurements, rotations, options, rounds=rounds)
     gaps = [with_gaps(found, p, s) for p, s in items]
     return replace(
         found,
@@ -127,90 +129,18 @@ def certify(
     )
 
 
-def _on_host(x: Any) -> np.ndarray:
-    x = np.asarray(x)
-    return x.astype(np.float64) if x.dtype.kind == "f" else x
+def on_host(records: Records) -> Records:
+    """Fetch records to the host: numpy arrays in their place, numbers in float64."""
+
+    def fetched(x: Any) -> np.ndarray:
+        x = np.asarray(x)
+        return x.astype(np.float64) if x.dtype.kind == "f" else x
+
+    return jax.tree.map(fetched, records)
 
 
-def _traced(problem: Problem, solution: Solution, about: About, known: dict[str, Any]) -> Certificate:
-    most = known["max_measurements"]
-    vectors = measurements(problem, solution, about, _most_members(about, most))
-    size = min(most, vectors.mask.shape[0])
-    kept, count = _first(vectors, size), jnp.sum(vectors.mask)
-    found = certify_rotation(
-        kept.src, kept.dst, kept.rotation,
-        noise_bound=kept.noise_bound, cbar2=problem.cbar2, mask=kept.mask, **known,
-    )  # fmt: skip
-    found = _unless(_too_many(solution, about, count, size, most), found)
-    return with_gaps(found, usable_rows(problem)[0], solution)
-
-
-def _host_measurements(problem: Problem, solution: Solution, about: About) -> Vectors:
-    if about == "pose":  # plain numpy: it is what is called most
-        return _about_pose(np, problem, solution)
-    with jax.enable_x64(True):
-        members = int(np.sum(solution.selection.clique))
-        return jax.device_get(measurements(problem, solution, about, members))
-
-
-def measurements(problem: Problem, solution: Solution, about: About, members: int) -> Vectors:
-    """The vectors that a certificate is about, source scaled; of the clique the first ``members``."""
-    p, _ = usable_rows(problem)
-    chosen = solution.selection
-    if about == "pose":
-        return _about_pose(jnp, p, solution)
-    cascade = cascade_pose(p, chosen)
-    clique = chosen.clique & p.mask
-    if p.pairs is not None:
-        pairs = jnp.asarray(p.pairs)
-        exist = clique[pairs[:, 0]] & clique[pairs[:, 1]]
-    elif about == "chain":
-        pairs, exist = ring_pairs(clique), clique
-    else:
-        rows = bits.listed(clique)[:members]
-        i, j = (np.asarray(x, np.int32) for x in np.triu_indices(members, 1))
-        pairs = jnp.stack([rows[i], rows[j]], axis=1)
-        exist = jnp.arange(members, dtype=jnp.int32) < jnp.sum(clique, dtype=jnp.int32)
-        exist = exist[i] & exist[j]
-    a, b = cascade.scale * tims(p.src, pairs), tims(p.dst, pairs)
-    return Vectors(a, b, tim_bounds(p.noise_bound, pairs), exist, cascade.rotation)
-
-
-def _about_pose(xp: ModuleType, p: Problem, solution: Solution) -> Vectors:
-    """Clique and inliers, about the centroids of the inliers: the joint fit is stationary there."""
-    chosen = solution.selection
-    keep = p.mask & (chosen.clique | chosen.inliers)
-    # Rows outside may hold anything, and must not reach the sums.
-    src, dst = (xp.where(keep[:, None], x, 0) for x in (p.src, p.dst))
-    weights = xp.where(keep & chosen.inliers, 1 / xp.where(keep, p.noise_bound, 1) ** 2, 0)
-    total = xp.sum(weights)
-    weights = weights / xp.where(total > 0, total, 1)
-    a, b = (x - xp.sum(weights[:, None] * x, axis=0) for x in (src, dst))
-    return Vectors(solution.pose.scale * a, b, p.noise_bound, keep, solution.pose.rotation)
-
-
-def _most_members(about: About, most: int) -> int:
-    """How many points have at most so many pairs."""
-    return int((1 + np.sqrt(1 + 8 * most)) // 2) if about == "complete" else most
-
-
-def _too_many(solution: Solution, about: About, count: Array, size: int, most: int) -> Bool[Array, ""]:
-    if about == "complete":
-        return jnp.sum(solution.selection.clique) > _most_members(about, most)
-    return count > size
-
-
-def _first(vectors: Vectors, size: int) -> Vectors:
-    """Those of the mask, moved to the front, as many as there is room for."""
-    where = bits.listed(vectors.mask)[:size]
-    exist = jnp.arange(size, dtype=jnp.int32) < jnp.sum(vectors.mask, dtype=jnp.int32)
-    return Vectors(
-        vectors.src[where], vectors.dst[where], vectors.noise_bound[where], exist, vectors.rotation
-    )
-
-
-def _unless(too_large: Bool[Array, ""], found: Certificate) -> Certificate:
-    """Nothing is proved of measurements that were left out."""
+def _nothing_proved_where(too_many: Bool[Array, ""], found: Certificate) -> Certificate:
+    """Take every claim back where measurements were left out."""
     nothing = replace(
         found,
         lower_bound=jnp.zeros_like(found.lower_bound),
@@ -220,20 +150,22 @@ def _unless(too_large: Bool[Array, ""], found: Certificate) -> Certificate:
         angle_bound=jnp.full_like(found.angle_bound, jnp.inf),
         status=jnp.full_like(found.status, CertificateStatus.TOO_LARGE),
     )
-    return jax.tree.map(lambda a, b: jnp.where(too_large, a, b), nothing, found)
+    return jax.tree.map(lambda a, b: jnp.where(too_many, a, b), nothing, found)
 
 
 def with_gaps(found: Certificate, problem: Problem, solution: Solution) -> Certificate:
-    """What the bound on the clique says of every pose whatever: its inliers are a clique, too."""
+    """Add what the bound on the clique says of every pose whatever: its inliers are a clique, too."""
     p = problem
     xp = namespace(p.src, solution.clique_upper_bound)
-    usable = p.mask & (p.noise_bound > 0) & (p.confidence > 0) & _finite(xp, p)
     most = xp.asarray(solution.clique_upper_bound)
     gap = most - xp.sum(solution.inliers)
-    explained = (solution.cost - (xp.sum(usable) - most) * p.cbar2) / (xp.maximum(most, 1) * p.cbar2)
-    return replace(found, inlier_gap=gap.astype(np.int32), explained_gap=explained)
+    unexplained = (xp.sum(_usable(p)) - most) * p.cbar2
+    explained_gap = (solution.cost - unexplained) / (xp.maximum(most, 1) * p.cbar2)
+    return replace(found, inlier_gap=gap.astype(np.int32), explained_gap=explained_gap)
 
 
-def _finite(xp: ModuleType, p: Problem) -> Bool[AnyArray, " n"]:
-    rows = xp.concatenate([p.src, p.dst, p.noise_bound[:, None], p.confidence[:, None]], axis=1)
-    return xp.all(xp.isfinite(rows), axis=1)
+def _usable(p: Problem) -> Bool[AnyArray, " n"]:
+    """Find the rows that the solver could use, on the host without JAX."""
+    xp = namespace(p.src)
+    numbers = xp.concatenate([p.src, p.dst, p.noise_bound[:, None], p.confidence[:, None]], axis=1)
+    return p.mask & (p.noise_bound > 0) & (p.confidence > 0) & xp.all(xp.isfinite(numbers), axis=1)

@@ -1,14 +1,13 @@
-"""Projections: on the dual matrices that annihilate the candidate, and on the semidefinite cone."""
+"""The projection on the dual matrices that annihilate the candidate."""
 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 
 def project_dual(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[Array, "n4 n4"]:
-    """The nearest Delta of the family (``dual.py``) with Delta x = 0 at the candidate, x = (e4, ..., e4).
+    """Find the nearest Delta of the family (``dual.py``) with Delta x = 0 at the candidate x = (e4, ..., e4).
 
     In closed form: off-diagonal 3x3 parts keep their skew half, diagonal ones lose their mean, and the last
     columns u_ij become y_ij = w_ij - (g_i - g_j) with w the antisymmetric half and g_i = (sum_j w_ij +
@@ -16,7 +15,7 @@ def project_dual(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[
     published.
 
     Args:
-        w: Symmetric.
+        w: Symmetric, in blocks of four.
         exists: 1 for blocks that exist, 0 for padding, which stays zero.
     """
     n = w.shape[0] // 4
@@ -42,16 +41,3 @@ def project_dual(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[
     found = found.at[:, :3, :, 3].set(y)
     found = found.at[:, 3, :, :3].set(jnp.transpose(y, (2, 0, 1)))
     return found.reshape(4 * n, 4 * n)
-
-
-def project_semidefinite(w: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """The nearest positive semidefinite matrix."""
-    values, vectors = jnp.linalg.eigh(w)
-    return jnp.matmul(vectors * jnp.maximum(values, 0), vectors.T, precision=lax.Precision.HIGHEST)
-
-
-def smallest_eigenvalue(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[Array, ""]:
-    """Of a symmetric matrix, over the blocks that exist; padding is no direction, wherever it stands."""
-    padding = jnp.repeat(exists == 0, 4, total_repeat_length=w.shape[0])
-    filled = w + jnp.diag(jnp.where(padding, jnp.max(jnp.abs(w)) + 1, 0))
-    return jnp.linalg.eigvalsh(0.5 * (filled + filled.T))[0]

@@ -10,7 +10,7 @@ These are the steps of ``certify_rotation``, in the frame of the candidate and i
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,18 +19,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
-from teaser_jax.certify.dual import coupled_guess, dual_matrix, dual_of
-from teaser_jax.certify.projection import smallest_eigenvalue
-from teaser_jax.certify.splitting import existing, reaches, reference, rounding, split
-from teaser_jax.stages.rotation.pair_search import polish
+from teaser_jax.certify.dual import coupled_guess, dual_matrix, dual_of, existing
+from teaser_jax.certify.options import CertifyMethod
+from teaser_jax.certify.semidefinite import factorisation_error, reaches, smallest_eigenvalue
+from teaser_jax.certify.splitting import reference, split
+from teaser_jax.ground.loops import until_settled
 from teaser_jax.stages.rotation.quadratic_form import Measurements
+from teaser_jax.stages.rotation.pair_search import polish
 
 # Costs below this share of one outlier's are zero: relative gaps say nothing there.
 ABSOLUTE_TOLERANCE = 1e-6
 # Curvatures away from the candidate that are tried, in units of the truncation.
 CURVATURES = (1e-2, 1e-4)
-
-CertifyMethod = Literal["splitting", "direct", "reference"]
 
 
 class Claim(NamedTuple):
@@ -53,8 +53,8 @@ class Attempt(NamedTuple):
     method: Int[Array, ""]
 
 
-def claim_of(m: Measurements, constant: Float[Array, ""], tolerance: Any) -> Claim:
-    """The verdict is on the rotation as given; the bound comes from the polished one.
+def claim_of(m: Measurements, constant: Float[Array, ""], tolerance: Float[Array, ""] | float) -> Claim:
+    """Say what is to be proved: the verdict is on the rotation given, the bound comes from the polished one.
 
     Where the given one costs more than the polished one by the tolerance or more, it is refuted, and what is
     left to prove is the polished one.
@@ -71,29 +71,32 @@ def claim_of(m: Measurements, constant: Float[Array, ""], tolerance: Any) -> Cla
 
 
 def direct(claim: Claim) -> Attempt:
-    """The closed form, with the correction for few outliers and, if that proves nothing, without."""
+    """Try the closed form, with the correction for few outliers and, if that proves nothing, without."""
     m = claim.polished
 
-    def guess(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    class State(NamedTuple):
+        matrix: Array
+        guesses: Array
+
+    def guess(state: State) -> tuple[State, Array]:
         # One guess in the program, and not two: it is half of what there is to compile.
-        _, _, tries = state
-        matrix = dual_matrix(m, coupled_guess(m, correct_outliers=tries == 0))
-        return matrix, reaches(m, matrix, claim.shift), tries + 1
+        matrix = dual_matrix(m, coupled_guess(m, correct_outliers=state.guesses == 0))
+        return State(matrix, state.guesses + 1), reaches(m, matrix, claim.shift)
 
     size = 4 * m.src.shape[0] + 4
-    start = jnp.zeros((size, size), m.src.dtype), jnp.zeros((), bool), jnp.int32(0)
-    matrix, proved, _ = lax.while_loop(lambda s: ~s[1] & (s[2] < 2), guess, start)
-    return Attempt(matrix, proved, jnp.int32(0), jnp.int32(CertifiedBy.DIRECT))
+    start = State(jnp.zeros((size, size), m.src.dtype), jnp.int32(0))
+    last, proved = until_settled(guess, start, iterations=2)
+    return Attempt(last.matrix, proved, jnp.int32(0), jnp.int32(CertifiedBy.DIRECT))
 
 
 def iterate(claim: Claim, attempt: Attempt, iterations: Int[Array, ""] | int) -> Attempt:
-    """The splitting, from the closed form without the correction, in which ``attempt`` ended."""
+    """Go on by the splitting from the closed form without the correction, in which ``attempt`` ended."""
     found = split(claim.polished, attempt.matrix, claim.shift, iterations=iterations)
     return Attempt(found.matrix, found.proved, found.rounds, jnp.int32(CertifiedBy.SPLITTING))
 
 
 def as_published(claim: Claim, iterations: int) -> Attempt:
-    """Algorithm 3, then one test of its best matrix like those of the others."""
+    """Run Algorithm 3, then test its best matrix once, as the other methods test theirs."""
     m = claim.polished
     count = jnp.sum(m.mask) + 1
     tolerance = claim.shift * count / jnp.where(m.cost > 0, m.cost, 1)
@@ -106,12 +109,21 @@ def prove(
     m: Measurements,
     frame: Float[Array, "3 3"],
     constant: Float[Array, ""],
-    tolerance: Any,
+    tolerance: Float[Array, ""] | float,
     *,
     iterations: int,
     method: CertifyMethod,
 ) -> Certificate:
-    """All steps in one program, for jit and vmap."""
+    """Take all steps in one program, for jit and vmap.
+
+    Args:
+        m: The measurements, in the frame of the rotation that was given.
+        frame: That rotation.
+        constant: Cost of the measurements that no rotation changes [-].
+        tolerance: The suboptimality that counts as optimal [-].
+        iterations: Cap on rounds of the splitting.
+        method: Where a dual matrix comes from.
+    """
     claim = claim_of(m, constant, tolerance)
     if method == "reference":
         attempt = as_published(claim, iterations)
@@ -124,21 +136,21 @@ def prove(
 
 
 def lowest_if_unproved(claim: Claim, attempt: Attempt) -> Float[Array, ""]:
-    """No eigenvalues are computed where a proof has said enough."""
+    """Bound all eigenvalues from below; none are computed where a proof has said enough."""
     return lax.cond(attempt.proved, lambda: -claim.shift, lambda: lowest_eigenvalue(claim, attempt))
 
 
 def lowest_eigenvalue(claim: Claim, attempt: Attempt) -> Float[Array, ""]:
-    """A number below all eigenvalues, by so much that a Cholesky factorisation can confirm it."""
+    """Find a number so far below all eigenvalues that a Cholesky factorisation can confirm it."""
     m = claim.polished
     lowest = smallest_eigenvalue(attempt.matrix, existing(m))
-    return jnp.minimum(lowest, 0) - 3 * rounding(m, attempt.matrix)
+    return jnp.minimum(lowest, 0) - 3 * factorisation_error(m, attempt.matrix)
 
 
 def read_off(
     frame: Float[Array, "3 3"], claim: Claim, attempt: Attempt, lowest: Float[Array, ""]
 ) -> Certificate:
-    """The certificate of an attempt: a bound always, a verdict where it is proved.
+    """Read the certificate off an attempt: a bound always, a verdict where it is proved.
 
     Args:
         frame: The rotation that was given.
@@ -146,13 +158,10 @@ def read_off(
         lowest: A number that no eigenvalue of the attempt's matrix lies below.
     """
     m, matrix = claim.polished, attempt.matrix
-    measured = jnp.sum(m.mask)
-    count = measured.astype(claim.given.dtype) + 1
-    error = rounding(m, matrix)
+    measured, error = jnp.sum(m.mask), factorisation_error(m, matrix)
     some, known = measured > 0, jnp.isfinite(claim.given)
     zero = some & (claim.given <= ABSOLUTE_TOLERANCE * m.cbar2)
-    unchanged = (claim.best - m.cost) * (1 - 1e-9)  # by any rotation
-    lower = jnp.clip(claim.best + count * lowest, unchanged, claim.best)
+    lower = _lower_bound(claim, measured, lowest)
     lower = jnp.where(some, jnp.where(zero | ~known, 0, lower), claim.given)
     gap = claim.given - lower
     everything = m.cbar2 * jnp.maximum(measured, 1)
@@ -164,15 +173,6 @@ def read_off(
     )
     angle = so3.rotation_angle(claim.turn)
     within = angle_bound + angle
-    status = jnp.int32(CertificateStatus.UNKNOWN)
-    for holds, what in (
-        (claim.shift <= 2 * error, CertificateStatus.UNDECIDABLE),
-        (optimal, CertificateStatus.OPTIMAL),
-        (~claim.possible, CertificateStatus.SUBOPTIMAL),
-        (~known, CertificateStatus.UNDECIDABLE),
-        (~some, CertificateStatus.NO_MEASUREMENTS),
-    ):
-        status = jnp.where(holds, jnp.int32(what), status)
     return Certificate(
         cost=claim.given,
         lower_bound=lower,
@@ -186,17 +186,45 @@ def read_off(
         method=jnp.where(
             zero, jnp.int32(CertifiedBy.ZERO_COST), jnp.where(some, attempt.method, CertifiedBy.NOTHING)
         ).astype(jnp.int32),
-        status=status,
+        status=_status(claim, optimal=optimal, known=known, some=some, error=error),
         rotation=so3.rotate(frame, claim.turn.T).T,
         angle=angle,
         dual=dual_of(m, matrix),
     )
 
 
+def _lower_bound(claim: Claim, measured: Int[Array, ""], lowest: Float[Array, ""]) -> Float[Array, ""]:
+    """Bound the cost of every rotation from below, by a number that no eigenvalue lies below."""
+    count = measured.astype(claim.given.dtype) + 1
+    unchanged = (claim.best - claim.polished.cost) * (1 - 1e-9)  # by any rotation
+    return jnp.clip(claim.best + count * lowest, unchanged, claim.best)
+
+
+def _status(
+    claim: Claim,
+    *,
+    optimal: Bool[Array, ""],
+    known: Bool[Array, ""],
+    some: Bool[Array, ""],
+    error: Float[Array, ""],
+) -> Int[Array, ""]:
+    """Choose the status; of all that hold the last in the list counts."""
+    status = jnp.int32(CertificateStatus.UNKNOWN)
+    for holds, what in (
+        (claim.shift <= 2 * error, CertificateStatus.UNDECIDABLE),
+        (optimal, CertificateStatus.OPTIMAL),
+        (~claim.possible, CertificateStatus.SUBOPTIMAL),
+        (~known, CertificateStatus.UNDECIDABLE),
+        (~some, CertificateStatus.NO_MEASUREMENTS),
+    ):
+        status = jnp.where(holds, jnp.int32(what), status)
+    return status
+
+
 def _others(
     claim: Claim, matrix: Float[Array, "n4 n4"], error: Float[Array, ""]
 ) -> tuple[Bool[Array, ""], Float[Array, ""]]:
-    """Whether M is positive away from the candidate x, and how far from it an equal rotation can be.
+    """Ask whether M is positive away from the candidate x, and how far from it an equal rotation can be.
 
     If M >= delta across x, a rotation at angle phi from the polished candidate costs at least
     delta n sin^2(phi / 2) more, but for what rounding leaves of M x.
@@ -211,20 +239,23 @@ def _others(
     leak = jnp.linalg.norm(jnp.matmul(matrix, x, precision=high)) + error
     heavy = jnp.trace(matrix) / count + m.cbar2
     lifted = matrix + heavy * (jnp.outer(x, x) + padding)
-    room = 3 * rounding(m, lifted)
+    room = 3 * factorisation_error(m, lifted)
     spare = claim.given - claim.best
 
-    def across(curvature: Array) -> tuple[Array, Array]:
-        delta = curvature * m.cbar2
-        return delta, reaches(m, lifted - (delta + room) * jnp.eye(len(x)), room)
+    curvatures = jnp.asarray(CURVATURES, matrix.dtype)
+
+    class State(NamedTuple):
+        delta: Array
+        curvature: Array  # which one is tried next
+
+    def across(state: State) -> tuple[State, Array]:
+        delta = curvatures[state.curvature] * m.cbar2
+        positive = reaches(m, lifted - (delta + room) * jnp.eye(len(x)), room)
+        return State(delta, state.curvature + 1), positive
 
     # The larger one first; one factorisation in the program, and not two.
-    curvatures = jnp.asarray(CURVATURES, matrix.dtype)
-    delta, unique, _ = lax.while_loop(
-        lambda s: ~s[1] & (s[2] < len(CURVATURES)),
-        lambda s: (*across(curvatures[s[2]]), s[2] + 1),
-        (jnp.ones((), matrix.dtype), jnp.zeros((), bool), jnp.int32(0)),
-    )
+    start = State(jnp.ones((), matrix.dtype), jnp.int32(0))
+    (delta, _), unique = until_settled(across, start, iterations=len(CURVATURES))
     root = jnp.sqrt(leak**2 * count + delta * (spare + leak * count))
     sine = (leak * jnp.sqrt(count) + root) / (delta * jnp.sqrt(count))
     angle = jnp.where(sine < 1, 2 * jnp.arcsin(jnp.minimum(sine, 1)), jnp.inf)

@@ -12,46 +12,48 @@ from jaxtyping import Array, Float
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertifiedBy
 from teaser_jax.certify.dual import Dual, dual_matrix
-from teaser_jax.certify.host import Rows, cut
+from teaser_jax.certify.host_measurements import HostMeasurements, without_padding
 from teaser_jax.certify.proof import Attempt, claim_of, lowest_if_unproved, read_off
-from teaser_jax.certify.splitting import reaches
+from teaser_jax.certify.semidefinite import reaches
 from teaser_jax.stages.rotation.quadratic_form import Measurements, in_frame_of
-from teaser_jax.stages.rotation.relaxation import RelaxationReport as Relaxation
-from teaser_jax.stages.rotation.relaxation import report, solve_relaxation
+from teaser_jax.stages.rotation.relaxation import RelaxationReport, report, solve_relaxation
 
 
-class ByRelaxation(NamedTuple):
+class RelaxedRotation(NamedTuple):
     """The rotation that the relaxation was rounded to, or the one given if that is no worse."""
 
-    rotation: np.ndarray
+    rotation: Float[np.ndarray, "3 3"]
     cost: float
     certificate: Certificate
-    relaxation: Relaxation
+    relaxation: RelaxationReport
 
 
-def relaxed_rotation(rows: Rows, rotation: np.ndarray, tolerance: float) -> ByRelaxation:
+def relaxed_rotation(
+    measurements: HostMeasurements, rotation: Float[np.ndarray, "3 3"], tolerance: float
+) -> RelaxedRotation:
     """Solve (23), round it, and turn the dual solution into a certificate.
 
     Args:
-        rows: The measurements; padding is cut off.
+        measurements: Vector pairs; padding is cut off.
         rotation: The best rotation known; the relaxation is written in its frame.
         tolerance: The suboptimality that counts as optimal [-].
     """
     with jax.enable_x64(True):
-        m, frame, constant = in_frame_of(rotation, **cut(rows)._asdict())
+        m, frame, constant = in_frame_of(rotation, **without_padding(measurements)._asdict())
         best = solve_relaxation(m)
         dual = Dual(jnp.asarray(best.relaxed.skew), jnp.asarray(best.relaxed.diagonal))
         frame, rounds = frame @ best.turn, np.int32(best.relaxed.iterations)
         found = _certificate(m, frame, constant, dual, best.turn, np.float64(tolerance), rounds)
         cost = best.cost + float(constant)
         relaxation = report(best.relaxed, best.cost)
-        return ByRelaxation(np.asarray(frame), cost, jax.device_get(found), relaxation)
+        return RelaxedRotation(np.asarray(frame), cost, jax.device_get(found), relaxation)
 
 
 @jax.jit
 def _certificate(
     m: Measurements, frame: Array, constant: Array, dual: Dual, turn: Array, tolerance: Array, rounds: Array
 ) -> Certificate:
+    """Certify the candidate that lies a turn from the one in whose frame the relaxation was written."""
     claim = claim_of(m.turned(turn), constant, tolerance)
     matrix = turned_dual(m, dual, turn @ claim.turn)
     proved = reaches(claim.polished, matrix, claim.shift)
@@ -60,13 +62,13 @@ def _certificate(
 
 
 def turned_dual(m: Measurements, dual: Dual, turn: Float[Array, "3 3"]) -> Float[Array, "n4 n4"]:
-    """The dual matrix M in the frame of another candidate, given from this one's by a turn.
+    """Carry the dual matrix M to the frame of another candidate, which lies a turn from this one.
 
     Quaternions of the two frames differ by a left factor, so blocks are multiplied by its 4 x 4 matrix on
     both sides, and those of measurements whose inlier label changes take the other sign.
     """
     other = m.turned(turn)
-    # A dual of zeros leaves Q - mu J.
+    # The dual of zeros, which leaves Q - mu J.
     nothing = Dual(jnp.zeros_like(dual.skew), jnp.zeros_like(dual.diagonal))
     delta = dual_matrix(m, dual) - dual_matrix(m, nothing)
     u, t = jnp.split(so3.quat_from_rotation(turn), [3])

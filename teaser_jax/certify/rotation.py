@@ -6,38 +6,29 @@ speaks of these measurements: it says optimal, never right.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from numbers import Real
-from typing import Any
+from typing import Any, get_args
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float
 
 from teaser_jax.certify.certificate import Certificate
-from teaser_jax.certify.host import certify_rows, compacted
-from teaser_jax.certify.proof import CertifyMethod, prove
+from teaser_jax.certify.host import certify_on_host
+from teaser_jax.certify.host_measurements import read_measurements
+from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.stack import certify_stack
-from teaser_jax.ground.arrays import AnyArray, is_traced
-from teaser_jax.ground.checks import whole_number
-from teaser_jax.stages.rotation.quadratic_form import in_frame_of
-
-TOLERANCE = 1e-3
-ITERATIONS = 200
-AFFORDABLE = 200  # measurements that can have all iterations
-MAX_MEASUREMENTS = 1000  # matrices of 128 MB, of which some eight live at once
+from teaser_jax.certify.traced import certify_traced
+from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.checks import one_of
 
 
+# Longer than other functions: the docstring of a public door says all about its arguments.
 def certify_rotation(
-    src: Float[AnyArray, "k 3"],
-    dst: Float[AnyArray, "k 3"],
-    rotation: Float[AnyArray, "3 3"],
+    src: Any,
+    dst: Any,
+    rotation: Any,
     *,
     noise_bound: Any,
     cbar2: Any = 1.0,
-    mask: Bool[AnyArray, " k"] | None = None,
+    mask: Any = None,
     tolerance: Any = TOLERANCE,
     iterations: int | None = None,
     method: CertifyMethod = "splitting",
@@ -51,8 +42,8 @@ def certify_rotation(
     those that it leaves, one by one.
 
     Args:
-        src, dst: Vectors, row k with row k [length]; a known scale is part of ``src``.
-        rotation: The candidate; projected on SO(3) first.
+        src, dst: (k, 3) vectors, row k with row k [length]; a known scale is part of ``src``.
+        rotation: (3, 3), the candidate; projected on SO(3) first.
         noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length].
         cbar2: Truncation, c-bar squared [-].
         mask: (k,) rows to use; rows that are not finite are left out.
@@ -78,33 +69,26 @@ def certify_rotation(
 
     References: Yang, Shi, Carlone, T-RO 2020, section VIII-C, problems (19) and (23), Algorithm 3.
     """
-    shape = _check(src, dst, rotation, method)
-    mask = np.ones(shape[:-1], bool) if mask is None else mask
-    iterations = (
-        default_iterations(shape[-2]) if iterations is None else whole_number("iterations", iterations, 0)
-    )
-    whole_number("max_measurements", max_measurements, 0)
-    if is_traced(src, dst, rotation, noise_bound, cbar2, mask, tolerance):
-        if len(shape) != 2:
+    one_of("method", method, get_args(CertifyMethod))
+    *stack, k, _ = _checked_shape(src, dst, rotation)
+    options = checked_options(tolerance, iterations, method, max_measurements)
+    mask = np.ones((*stack, k), bool) if mask is None else mask
+    known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
+    if is_traced(src, dst, rotation, known, tolerance):
+        if stack:
             raise ValueError("a stack of problems was given inside jit: use jax.vmap(certify_rotation).")
-        if shape[0] > max_measurements:
-            raise ValueError(f"{shape[0]} measurements are more than max_measurements, {max_measurements}.")
-        dtype = jnp.promote_types(jnp.result_type(src), jnp.float32)
-        mask = as_mask(mask, shape[:1])
-        if not is_traced(tolerance):
-            check_tolerance(tolerance)
-        src, dst, rotation, noise_bound, cbar2 = lax.stop_gradient((src, dst, rotation, noise_bound, cbar2))
-        with jax.enable_x64(True):
-            m, frame, constant = in_frame_of(
-                rotation, src, dst, noise_bound=noise_bound, cbar2=cbar2, mask=mask
-            )
-            found = prove(m, frame, constant, tolerance, iterations=iterations, method=method)
-            return narrowed(found, dtype)
-    known: dict[str, Any] = dict(iterations=iterations, method=method, most=max_measurements)
-    if len(shape) == 2:
-        rows = compacted(src, dst, noise_bound, cbar2, mask)
-        return certify_rows(rows, _checked(rotation), check_tolerance(tolerance), **known)
-    b, k = shape[:2]
+        return certify_traced(src, dst, rotation, **known, options=options, rounds=options.rounds(k))
+    if stack:
+        return _stack_on_host(src, dst, _finite(rotation), **known, options=options)
+    measurements = read_measurements(src, dst, **known)
+    return certify_on_host(measurements, _finite(rotation), options, rounds=options.rounds(k))
+
+
+def _stack_on_host(
+    src: Any, dst: Any, rotation: np.ndarray, *, noise_bound: Any, cbar2: Any, mask: Any, options: Options
+) -> Certificate:
+    """Certify a stack of rotations, (b, 3, 3) or one for all, each against its own measurements."""
+    b, k = np.shape(src)[:2]
     mask = np.asarray(mask, bool)
     stacked = {"noise_bound": (noise_bound, (b, k)), "cbar2": (cbar2, (b,)), "mask": (mask, (b, k))}
     for name, (value, expected) in stacked.items():
@@ -114,25 +98,18 @@ def certify_rotation(
             )
     if b == 0:
         raise ValueError("the stack holds no problem.")
-    bounds, cbar2s, masks = (np.broadcast_to(value, expected) for value, expected in stacked.values())
-    items = [compacted(src[i], dst[i], bounds[i], cbar2s[i], masks[i]) for i in range(b)]
-    rotations = np.broadcast_to(_checked(rotation), (b, 3, 3))
-    return certify_stack(items, rotations, check_tolerance(tolerance), **known)
+    bounds, truncations, masks = (np.broadcast_to(value, expected) for value, expected in stacked.values())
+    items = [read_measurements(src[i], dst[i], bounds[i], truncations[i], masks[i]) for i in range(b)]
+    rotations = np.broadcast_to(rotation, (b, 3, 3))
+    return certify_stack(items, rotations, options, rounds=options.rounds(k))
 
 
-def default_iterations(k: int) -> int:
-    """Rounds of the splitting that cost what 200 rounds on 200 measurements do."""
-    return ITERATIONS if k <= AFFORDABLE else max(3, round(ITERATIONS * (AFFORDABLE / k) ** 3))
-
-
-def _check(src: Any, dst: Any, rotation: Any, method: str) -> tuple[int, ...]:
-    if method not in ("splitting", "direct", "reference"):
-        raise ValueError(f"method is {method!r}: expected 'splitting', 'direct' or 'reference'.")
+def _checked_shape(src: Any, dst: Any, rotation: Any) -> tuple[int, ...]:
+    """Return the shape of the vectors, (k, 3) or (b, k, 3); ValueError if the others do not fit it."""
     a, b, r = np.shape(src), np.shape(dst), np.shape(rotation)
-    fits = a == b and len(a) in (2, 3) and a[-1] == 3 and r in ((3, 3), (*a[:-2], 3, 3))
     if any(np.iscomplexobj(x) for x in (src, dst, rotation) if not is_traced(x)):
         raise ValueError("src, dst and rotation are real; complex numbers were received.")
-    if not fits:
+    if not (a == b and len(a) in (2, 3) and a[-1] == 3 and r in ((3, 3), (*a[:-2], 3, 3))):
         raise ValueError(
             f"src, dst and rotation have shapes {a}, {b} and {r}: expected (k, 3), (k, 3) and (3, 3), rows "
             "being measurements; or stacks of them."
@@ -140,37 +117,9 @@ def _check(src: Any, dst: Any, rotation: Any, method: str) -> tuple[int, ...]:
     return a
 
 
-def _checked(rotation: Any) -> np.ndarray:
+def _finite(rotation: Any) -> np.ndarray:
+    """Read a candidate, or a stack of them, in float64; ValueError if it is not finite."""
     rotation = np.asarray(rotation, np.float64)
     if not np.all(np.isfinite(rotation)):
         raise ValueError(f"rotation is not finite: {rotation.tolist()}.")
     return rotation
-
-
-def check_tolerance(value: Any) -> float:
-    """A number between 0 and 1, or ValueError."""
-    if not isinstance(value, Real) and np.shape(value) != () or not 0 < value < 1:
-        raise ValueError(f"tolerance is {value!r}: expected a number between 0 and 1.")
-    return float(value)
-
-
-def as_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Array, " k"]:
-    """The mask of traced measurements; ValueError if it is not one value a row."""
-    mask = jnp.asarray(mask)
-    if mask.shape != shape:
-        raise ValueError(f"mask has shape {mask.shape}: expected {shape}.")
-    return mask.astype(bool)
-
-
-def narrowed(found: Certificate, dtype: Any) -> Certificate:
-    """In the dtype of the input, for JAX may have no float64 outside; what is claimed is rounded down."""
-    cast = jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, found)
-    if dtype == jnp.float64:
-        return cast
-    eps = 2 * jnp.finfo(dtype).eps
-    return replace(
-        cast,
-        lower_bound=cast.lower_bound * (1 - eps),
-        suboptimality=cast.suboptimality + eps,
-        absolute_gap=cast.absolute_gap + eps,
-    )

@@ -14,8 +14,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from teaser_jax.certify.dual import dual_matrix, reference_guess
-from teaser_jax.certify.projection import project_dual, project_semidefinite, smallest_eigenvalue
+from teaser_jax.certify.dual import dual_matrix, existing, reference_guess
+from teaser_jax.certify.projection import project_dual
+from teaser_jax.certify.semidefinite import project_semidefinite, reaches, smallest_eigenvalue
+from teaser_jax.ground.loops import until_settled
 from teaser_jax.stages.rotation.quadratic_form import Measurements
 
 RELAXATION = 1.999999  # any number below 2 converges, and the largest is the fastest in practice
@@ -26,36 +28,11 @@ MARGINS, UNTIL = (0.03, 0.02, 0.01), (20, 60)
 
 
 class Split(NamedTuple):
-    """The last affine iterate, whether it is semidefinite enough, and the rounds it took."""
+    """The last affine iterate, whether it was proved to be semidefinite enough, and the rounds it took."""
 
     matrix: Float[Array, "n4 n4"]
     proved: Bool[Array, ""]
     rounds: Int[Array, ""]
-
-
-def existing(m: Measurements) -> Float[Array, " n"]:
-    """1 for the blocks of the quaternion and of measurements that exist."""
-    return jnp.concatenate([jnp.ones(1, m.src.dtype), m.mask.astype(m.src.dtype)])
-
-
-def rounding(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Float[Array, ""]:
-    """How far below zero eigenvalues may be although a Cholesky factorisation came to its end.
-
-    The backward error of the factorisation, (N + 2) eps trace, and that of making the matrix.
-    """
-    eps = jnp.finfo(matrix.dtype).eps
-    terms = jnp.sum(m.src**2) + jnp.sum(m.dst**2) + jnp.sum(m.mask) * m.cbar2
-    return eps * ((matrix.shape[0] + 2) * jnp.sum(jnp.abs(jnp.diagonal(matrix))) + 32 * terms)
-
-
-def reaches(m: Measurements, matrix: Float[Array, "n4 n4"], shift: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether it is proved that no eigenvalue is below -shift: one Cholesky, rounding accounted for.
-
-    A shift that rounding could swallow proves nothing.
-    """
-    error = rounding(m, matrix)
-    shifted = 0.5 * (matrix + matrix.T) + (shift - error) * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-    return (shift > 2 * error) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(shifted)))
 
 
 def split(
@@ -65,7 +42,14 @@ def split(
     *,
     iterations: Int[Array, ""] | int = 200,
 ) -> Split:
-    """Iterate from a dual matrix until one is proved to have no eigenvalue below ``-shift``."""
+    """Iterate from a dual matrix until one is proved to have no eigenvalue below ``-shift``.
+
+    Args:
+        m: The measurements, in the frame of the candidate.
+        start: The first dual matrix M.
+        shift: How far below zero eigenvalues may lie.
+        iterations: Cap on rounds.
+    """
     exists = existing(m)
     scale = jnp.tile(jnp.array([VECTOR_SCALE] * 3 + [1.0], start.dtype), exists.shape[0])
     first = start * scale[:, None] * scale
@@ -75,23 +59,21 @@ def split(
     class State(NamedTuple):
         iterate: Array
         affine: Array
-        proved: Array
         rounds: Array
 
-    def once(state: State) -> State:
+    def once(state: State) -> tuple[State, Array]:
         inside = margins[jnp.sum(state.rounds >= jnp.array(UNTIL))] * across
         cone = project_semidefinite(state.iterate - inside) + inside
         affine = first + project_dual(2 * cone - state.iterate - first, exists)
         proved = reaches(m, affine / scale[:, None] / scale, shift)
-        return State(state.iterate + RELAXATION * (affine - cone), affine, proved, state.rounds + 1)
+        return State(state.iterate + RELAXATION * (affine - cone), affine, state.rounds + 1), proved
 
-    state = State(first, first, jnp.zeros((), bool), jnp.zeros((), jnp.int32))
-    final = lax.while_loop(lambda s: ~s.proved & (s.rounds < iterations), once, state)
-    return Split(final.affine / scale[:, None] / scale, final.proved, final.rounds)
+    final, proved = until_settled(once, State(first, first, jnp.int32(0)), iterations=iterations)
+    return Split(final.affine / scale[:, None] / scale, proved, final.rounds)
 
 
 def _across(exists: Float[Array, " n"]) -> Float[Array, "n4 n4"]:
-    """The projection that takes out the candidate, x = (e4, ..., e4), on the blocks that exist."""
+    """Make the projection that takes out the candidate, x = (e4, ..., e4), on the blocks that exist."""
     candidate = jnp.kron(exists, jnp.array([0, 0, 0, 1], exists.dtype)) / jnp.sqrt(jnp.sum(exists))
     return jnp.diag(jnp.repeat(exists, 4, total_repeat_length=4 * exists.shape[0])) - jnp.outer(
         candidate, candidate
@@ -99,7 +81,7 @@ def _across(exists: Float[Array, " n"]) -> Float[Array, "n4 n4"]:
 
 
 class Trajectory(NamedTuple):
-    """The published method, round by round: suboptimality of each affine iterate, NaN behind the end."""
+    """The published method round by round: the suboptimality of each affine iterate, NaN behind the end."""
 
     suboptimality: Float[Array, " t"]
     matrix: Float[Array, "n4 n4"]  # the affine iterate of the smallest one
@@ -107,9 +89,9 @@ class Trajectory(NamedTuple):
 
 
 def reference(m: Measurements, *, tolerance: Float[Array, ""] | float, iterations: int = 200) -> Trajectory:
-    """Algorithm 3 as published: plain guess and coordinates, the smallest eigenvalue in every round.
+    """Run Algorithm 3 as published: plain guess and coordinates, the smallest eigenvalue in every round.
 
-    Slow, and here for comparison and conformance.
+    It is slow, and here for comparison and conformance.
     """
     first, exists, mu = dual_matrix(m, reference_guess(m)), existing(m), m.cost
     count = jnp.sum(exists)

@@ -8,76 +8,84 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import (
     QUICKLY,
-    Rows,
-    at_once,
-    certify_rows,
+    ClosedForm,
+    after_closed_form,
+    certify_on_host,
     closed_form,
-    cut,
-    go_on,
-    padded,
+    in_float64,
     with_blocks,
 )
-from teaser_jax.certify.proof import CertifyMethod
+from teaser_jax.certify.host_measurements import HostMeasurements, padded, without_padding
+from teaser_jax.certify.options import Options
 
 CHUNK_BYTES = 256 << 20  # of the matrices of the closed form; some eight of each live at once
 
 
 def certify_stack(
-    items: Sequence[Rows],
-    rotations: np.ndarray,
-    tolerance: float,
+    items: Sequence[HostMeasurements],
+    rotations: Float[np.ndarray, "b 3 3"],
+    options: Options,
     *,
-    iterations: int,
-    method: CertifyMethod,
-    most: int,
+    rounds: int,
 ) -> Certificate:
-    """A certificate for each item, with a leading axis; those too large or published go one by one."""
+    """Certify each item, and return the certificates as one with a leading axis.
+
+    Items that are too large go one by one, and so do all where the method is the published one.
+    """
     found: dict[int, Certificate] = {}
-    together = [i for i, rows in enumerate(items) if method != "reference" and rows.mask.sum() <= most]
+    alike = options.method != "reference"
+    together = [i for i, item in enumerate(items) if alike and item.measured <= options.max_measurements]
     # In fours: a sixth more rows is a half more time.
-    size = 4 * -(-max([int(items[i].mask.sum()) for i in together], default=4) // 4)
+    size = 4 * -(-max([items[i].measured for i in together], default=4) // 4)
     step = max(1, CHUNK_BYTES // (8 * (4 * size + 4) ** 2))
     for start in range(0, len(together), step):
         chunk = np.array(together[start : start + step])
-        several = at_once(partial(_chunk, items, rotations, chunk, size, tolerance, iterations, method))
+        several = in_float64(partial(_chunk, items, rotations, chunk, size, options, rounds))
         found |= dict(zip(chunk.tolist(), several, strict=True))
     for i in set(range(len(items))) - found.keys():
-        found[i] = certify_rows(
-            items[i], rotations[i], tolerance, iterations=iterations, method=method, most=most
-        )
+        found[i] = certify_on_host(items[i], rotations[i], options, rounds=rounds)
     n = max((len(c.dual.skew) for c in found.values()), default=1)
     return jax.tree.map(lambda *x: np.stack(x), *(with_blocks(found[i], n) for i in range(len(items))))
 
 
 def _chunk(
-    items: Sequence[Rows], rotations: np.ndarray, chunk: np.ndarray, size: int,
-    tolerance: float, iterations: int, method: CertifyMethod,
-) -> list[Certificate]:  # fmt: skip
+    items: Sequence[HostMeasurements],
+    rotations: Float[np.ndarray, "b 3 3"],
+    chunk: Int[np.ndarray, " c"],
+    size: int,
+    options: Options,
+    rounds: int,
+) -> list[Certificate]:
+    """Certify the items of a chunk: the closed form at once, what it leaves one by one."""
     # Filled up to a power of two, so that few sizes are compiled.
     places = np.minimum(np.arange(1 << (len(chunk) - 1).bit_length()), len(chunk) - 1)
-    rows = jax.tree.map(lambda *x: np.stack(x), *(padded(cut(items[chunk[i]]), size) for i in places))
-    found, settled, hopeful, states = jax.device_get(
-        _closed_forms(rows, rotations[chunk[places]], np.float64(tolerance))
+    several = jax.tree.map(
+        lambda *x: np.stack(x), *(padded(without_padding(items[chunk[i]]), size) for i in places)
     )
+    found = jax.device_get(_closed_forms(several, rotations[chunk[places]], np.float64(options.tolerance)))
 
     def one(i: int) -> Certificate:
-        if settled[i]:
-            return jax.tree.map(lambda x: x[i], found)
-        state = jax.tree.map(lambda x: x[i], states)
-        return jax.device_get(go_on(state, hopeful=hopeful[i], iterations=iterations, method=method))
+        if found.settled[i]:
+            return jax.tree.map(lambda x: x[i], found.certificate)
+        pending = jax.tree.map(lambda x: x[i], found.pending)
+        return jax.device_get(
+            after_closed_form(pending, hopeful=found.hopeful[i], rounds=rounds, method=options.method)
+        )
 
     return [one(i) for i in range(len(chunk))]
 
 
 @partial(jax.jit, compiler_options=QUICKLY)
-def _closed_forms(rows: Rows, rotations: Array, tolerance: Array) -> Any:
-    return jax.vmap(lambda rows, rotation: closed_form(rows, rotation, tolerance))(rows, rotations)
+def _closed_forms(
+    several: HostMeasurements, rotations: Float[Array, "c 3 3"], tolerance: Float[Array, ""]
+) -> ClosedForm:
+    """Try the closed form on all at once."""
+    return jax.vmap(lambda item, rotation: closed_form(item, rotation, tolerance))(several, rotations)

@@ -27,7 +27,7 @@ def verify(
     cbar2: float = 1.0,
     tolerance: float = 1e-3,
 ) -> bool:
-    """Whether the claims of a certificate about a rotation hold, from the data and the stored dual alone.
+    """Check the claims of a certificate about a rotation, from the data and the stored dual alone.
 
     Args:
         src, dst, noise_bound, cbar2: The measurements that were certified, those of the mask only.
@@ -61,7 +61,7 @@ def verify(
 
 
 def _follows(a: np.ndarray, b: np.ndarray, r: np.ndarray, c: Any, cbar2: float, tolerance: float) -> bool:
-    """Whether everything else follows from the lower bound."""
+    """Check that all other claims of the certificate c follow from its lower bound."""
     left, _, right = np.linalg.svd(r)
     r = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     cost = np.minimum(np.sum((b - a @ r.T) ** 2, axis=1), cbar2).sum()
@@ -82,7 +82,7 @@ def _follows(a: np.ndarray, b: np.ndarray, r: np.ndarray, c: Any, cbar2: float, 
 def is_lower_bound(
     a: np.ndarray, b: np.ndarray, cbar2: float, lower: float, rotation: Any, skew: Any, diagonal: Any
 ) -> bool:
-    """Whether it is proved that no rotation of (a, b) costs less than ``lower``.
+    """Check that it is proved that no rotation of (a, b) costs less than ``lower``.
 
     The rotation is the one that the dual belongs to. Measurements are in units of their bounds.
     """
@@ -106,6 +106,25 @@ def is_lower_bound(
         return False
 
     n = len(a) + 1
+    matrix = _rebuilt_matrix(a, b, cbar2, mu, skew, diagonal)
+    shift = (mu + constant - lower) / n
+    # A factorisation that comes to its end proves eigenvalues above -(N + 2) eps trace; making M errs, too.
+    size = np.sum(a * a) + np.sum(b * b) + len(a) * cbar2
+    error = EPS * ((4 * n + 2) * np.abs(np.diagonal(matrix)).sum() + 32 * size)
+    if not shift > 2 * error:
+        return False
+    try:
+        np.linalg.cholesky(matrix + (shift - error) * np.eye(4 * n))
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _rebuilt_matrix(
+    a: np.ndarray, b: np.ndarray, cbar2: float, mu: float, skew: np.ndarray, diagonal: np.ndarray
+) -> np.ndarray:
+    """Build M = Q - mu J + Delta from the measurements, their cost mu, and the free numbers of Delta."""
+    n = len(a) + 1
     m = np.zeros((n, 4, n, 4))
     theta = np.where(np.sum((a - b) ** 2, axis=1) <= cbar2, 1.0, -1.0)
     for k in range(1, n):
@@ -128,15 +147,4 @@ def is_lower_bound(
     m[0, :, 0, :] -= symmetric.sum(axis=0) + mu * np.eye(4)
 
     matrix = m.reshape(4 * n, 4 * n)
-    matrix = (matrix + matrix.T) / 2
-    shift = (mu + constant - lower) / n
-    # A factorisation that comes to its end proves eigenvalues above -(N + 2) eps trace; making M errs, too.
-    size = np.sum(a * a) + np.sum(b * b) + len(a) * cbar2
-    error = EPS * ((4 * n + 2) * np.abs(np.diagonal(matrix)).sum() + 32 * size)
-    if not shift > 2 * error:
-        return False
-    try:
-        np.linalg.cholesky(matrix + (shift - error) * np.eye(4 * n))
-    except np.linalg.LinAlgError:
-        return False
-    return True
+    return (matrix + matrix.T) / 2
