@@ -8,11 +8,14 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jax import lax
+from jaxtyping import Array, Float
 
 # numpy's on the host, JAX's on the device, and while JAX rebuilds records also its placeholders: shapes and
 # dtypes without numbers, axes of vmap, whatever `jax.tree.map` returned.
 AnyArray: TypeAlias = Any
+
+Number: TypeAlias = float | int | np.number
 
 CONCRETE = (np.ndarray, float, int, type(None))
 
@@ -47,6 +50,39 @@ def rounded_product(a: Array, b: Array) -> Array:
     """
     product = a * b
     return jnp.maximum(product, jnp.finfo(product.dtype).min)
+
+
+def inner_products(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
+    """Multiply every row of ``a`` with every row of ``b``, in full precision on every backend.
+
+    Gradients: exact.
+    """
+    return jnp.matmul(a, b.T, precision=lax.Precision.HIGHEST)
+
+
+def squared_distances(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
+    """Square the distance of every row of ``a`` from every row of ``b``.
+
+    As |a|^2 + |b|^2 - 2 a.b, one product of matrices: rows should lie about the origin, or the squares of far
+    coordinates cancel.
+
+    Gradients: exact.
+    """
+    return jnp.sum(a * a, axis=1)[:, None] + jnp.sum(b * b, axis=1) - 2 * inner_products(a, b)
+
+
+def at_least_float32(values: AnyArray) -> Float[Array, "..."]:
+    """Convert to a JAX array of float32 or wider.
+
+    Integers would cut bounds, and half precision has no linear algebra.
+
+    Raises:
+        ValueError: For complex numbers.
+    """
+    values = jnp.asarray(values)
+    if jnp.issubdtype(values.dtype, jnp.complexfloating):
+        raise ValueError("complex numbers were received: points are real.")
+    return values.astype(jnp.promote_types(values.dtype, jnp.float32))
 
 
 def as_numpy(value: Any, name: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Pieces for training loops: a teacher, losses, soft matching, a small network and a loop; all under jit."""
+"""What training loops call: a teacher, losses, soft matching, a small network and a loop; all under jit."""
 
 from teaser_jax.learn.losses import (
     inlier_loss,
