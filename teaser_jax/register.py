@@ -70,6 +70,11 @@ class Registration:
         return certify_pose(self.problem, self.solution)
 
     @property
+    def has_certificate(self) -> bool:
+        """Whether the certificate is there already; to read ``certificate`` computes it."""
+        return "certificate" in vars(self)
+
+    @property
     def ok(self) -> bool:
         """Whether to trust the pose."""
         return self.status == Status.OK
