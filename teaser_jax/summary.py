@@ -30,7 +30,7 @@ def summary(result: Registration) -> str:
         f"  scale        {float(result.pose.scale):.6g}",
         f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) ({quaternion})",
         f"  translation  ({x:.6g}, {y:.6g}, {z:.6g})",
-        f"  cost         {float(s.cost):.6g} = sum over matches of (residual / noise bound)^2, cbar2 at most",
+        f"  cost         {float(s.cost):.6g}: each match adds (residual / noise bound)^2, but cbar2 at most",
         *_proofs(result),
         f"  {result.status.advice}",
     ]

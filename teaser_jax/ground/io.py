@@ -60,12 +60,12 @@ def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
 
 
 @contextmanager
-def or_unwritable(path: Path, what: str = "cannot be written") -> Iterator[None]:
+def os_errors_named(path: Path, what: str) -> Iterator[None]:
     """Turn an OSError of the block into a FileError that names the path and says ``what`` is wrong."""
     try:
         yield
     except OSError as error:
-        raise FileError(f"{path}: {what}: {error.strerror or error}.") from error
+        raise FileError(f"{path}: {what}: {error.strerror or one_line(error)}.") from error
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
