@@ -158,7 +158,7 @@ def awkward(kind: str, rng: np.random.Generator, n: int = 32) -> tuple[np.ndarra
         src[:] = src[0]
     if kind == "two points":
         src[::2], src[1::2] = src[0], src[1]
-    rotation = tj.synthetic.random_rotation(rng)
+    rotation = tj.synthetic.draw_rotation(rng)
     dst = src @ rotation.T + rng.uniform(-1, 1, 3)
     if kind == "mirrored":
         dst = dst * [-1, 1, 1]

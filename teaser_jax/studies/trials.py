@@ -61,7 +61,7 @@ Draw: TypeAlias = Callable[[tuple[int, ...], float, Model], SyntheticProblem]
 
 
 def seed_of(study: str, seed: int, value: float, number: int) -> tuple[int, ...]:
-    """Make the seed of one problem from its study, the user's seed, the cell and the run, and nothing else."""
+    """Make the seed of one problem from its study, the user's seed, the cell, the run, and nothing else."""
     return seed, crc32(study.encode()), round(10_000 * value), number
 
 
