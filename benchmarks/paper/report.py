@@ -12,6 +12,7 @@ import numpy as np
 
 from benchmarks.paper.claims import CLAIMS, COMPETITORS, PaperClaim
 from benchmarks.paper.verdicts import Models, Verdict, median
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError, os_errors_named, replacing
 from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.results import ABOUT, PICTURE, Results, read_results
@@ -162,7 +163,7 @@ def _made_with(environments: list[dict[str, Any]]) -> Iterator[str]:
         yield ""
 
 
-def _grid(results: Results, methods: list[str], cell: Callable[[str, float], str]) -> Iterator[str]:
+def _grid(results: Results, methods: list[str], cell: Callable[[str, Number], str]) -> Iterator[str]:
     values = results.values
     heads = [f"{v:g}" if results.study.sweep == MATCHES else f"{v:.0%}" for v in values]
     yield f"| {LABELS[results.study.sweep]} | " + " | ".join(heads) + " |"
@@ -173,6 +174,6 @@ def _grid(results: Results, methods: list[str], cell: Callable[[str, float], str
     yield ""
 
 
-def _number(results: Results, method: str, value: float, measure: Measure) -> str:
+def _number(results: Results, method: str, value: Number, measure: Measure) -> str:
     number = median(results, method, value, measure.column)
     return "" if np.isnan(number) else f"{number:.2g}"

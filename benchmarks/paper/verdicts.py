@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from teaser_jax.ground.arrays import Number
 from teaser_jax.studies.methods import LIMIT, OURS
 from teaser_jax.studies.results import Results
 from teaser_jax.studies.study import OVERLAP
@@ -29,20 +30,20 @@ class Verdict:
     holds: bool | None = None
 
 
-def median(results: Results, method: str, value: float, column: str) -> float:
+def median(results: Results, method: str, value: Number, column: str) -> float:
     """Return the median of a column in one cell; NaN where there is none."""
     numbers = results.measured(method, value, column)
     numbers = numbers[np.isfinite(numbers)]
     return float(np.median(numbers)) if len(numbers) else float("nan")
 
 
-def up_to(results: Results, last: float) -> list[float]:
+def up_to(results: Results, last: Number) -> list[Number]:
     """List the cells that are no harder than one of them: more overlap, or fewer wrong matches."""
     down = results.study.sweep == OVERLAP
     return [v for v in results.values if (v >= last if down else v <= last)]
 
 
-def robust_to(method: str, last: float) -> Callable[[Results], Verdict]:
+def robust_to(method: str, last: Number) -> Callable[[Results], Verdict]:
     """Test that a method is right in nearly all runs up to a value (down to it, where overlap is swept)."""
 
     def test(results: Results) -> Verdict:
@@ -60,7 +61,7 @@ def robust_to(method: str, last: float) -> Callable[[Results], Verdict]:
     return test
 
 
-def breaks_at(word: str, value: float) -> Callable[[Results], Verdict]:
+def breaks_at(word: str, value: Number) -> Callable[[Results], Verdict]:
     """Test that a method whose name holds a word fails at a value."""
 
     def say(results: Results, name: str) -> Verdict:
@@ -71,7 +72,7 @@ def breaks_at(word: str, value: float) -> Callable[[Results], Verdict]:
     return _of_one(word, value, say)
 
 
-def holds_at(word: str, value: float) -> Callable[[Results], Verdict]:
+def holds_at(word: str, value: Number) -> Callable[[Results], Verdict]:
     """Test that a method whose name holds a word is right in nine of ten runs at a value."""
 
     def say(results: Results, name: str) -> Verdict:
@@ -81,7 +82,7 @@ def holds_at(word: str, value: float) -> Callable[[Results], Verdict]:
     return _of_one(word, value, say)
 
 
-def best_at(word: str, value: float) -> Callable[[Results], Verdict]:
+def best_at(word: str, value: Number) -> Callable[[Results], Verdict]:
     """Test that a method whose name holds a word is right more often than every other at a value."""
 
     def say(results: Results, name: str) -> Verdict:
@@ -93,7 +94,7 @@ def best_at(word: str, value: float) -> Callable[[Results], Verdict]:
     return _of_one(word, value, say)
 
 
-def _of_one(word: str, value: float, say: Callable[[Results, str], Verdict]) -> Callable[[Results], Verdict]:
+def _of_one(word: str, value: Number, say: Callable[[Results, str], Verdict]) -> Callable[[Results], Verdict]:
     """Make a test of the first method whose name holds a word, where it was run at a value."""
 
     def test(results: Results) -> Verdict:
@@ -103,7 +104,7 @@ def _of_one(word: str, value: float, say: Callable[[Results, str], Verdict]) -> 
     return test
 
 
-def faster_than(method: str, milliseconds: float) -> Callable[[Results], Verdict]:
+def faster_than(method: str, milliseconds: Number) -> Callable[[Results], Verdict]:
     """Test that the median time of a method lies below a limit in every cell."""
 
     def test(results: Results) -> Verdict:
@@ -115,7 +116,7 @@ def faster_than(method: str, milliseconds: float) -> Callable[[Results], Verdict
     return test
 
 
-def less_robust(value: float) -> Callable[[Results], Verdict]:
+def less_robust(value: Number) -> Callable[[Results], Verdict]:
     """Test that consensus maximisation fails where TLS does not, or more often."""
 
     def test(results: Results) -> Verdict:
@@ -128,7 +129,7 @@ def less_robust(value: float) -> Callable[[Results], Verdict]:
     return test
 
 
-def _listed(results: Results, method: str, values: Iterable[float]) -> str:
+def _listed(results: Results, method: str, values: Iterable[Number]) -> str:
     return ", ".join(f"{results.success(method, v):.0%} at {v:.0%}" for v in values)
 
 

@@ -21,13 +21,13 @@ class _Parser(argparse.ArgumentParser):
 
 def parser() -> argparse.ArgumentParser:
     """Make the parser of the command line; ``command`` of what it returns names the module that runs."""
-    whole = _Parser(
+    program = _Parser(
         prog="teaser-jax",
         description="Robust registration of matched 3-D points.",
         epilog="Exit codes: 0 ok, 1 no trustworthy answer (the status says why), 2 bad input.",
     )
-    whole.add_argument("--version", action="version", version=f"teaser-jax {__version__}")
-    commands = whole.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    program.add_argument("--version", action="version", version=f"teaser-jax {__version__}")
+    commands = program.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_register(commands.add_parser("register", help="find the pose behind a file of matches"))
     _add_demo(
         commands.add_parser("demo", help="register 1000 matches of which 950 are wrong, and draw the answer")
@@ -35,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
     _add_study(
         commands.add_parser("study", help="run the paper's studies: tables and figures of many problems")
     )
-    return whole
+    return program
 
 
 def _add_register(register: argparse.ArgumentParser) -> None:

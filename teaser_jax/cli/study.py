@@ -68,8 +68,8 @@ def _place_in(cluster: str) -> tuple[str, int, int]:
     """Read HOST:PORT,N,K: the address, the number of processes, and which of them this one is."""
     address, *numbers = cluster.split(",")
     host, _, port = address.rpartition(":")
-    whole = all(x.isdecimal() for x in (port, *numbers))
-    if len(numbers) != 2 or not host or not whole or not 0 < int(port) < 2**16 or int(numbers[0]) < 1:
+    decimal = all(x.isdecimal() for x in (port, *numbers))
+    if len(numbers) != 2 or not host or not decimal or not 0 < int(port) < 2**16 or int(numbers[0]) < 1:
         raise StudyError(f"--cluster is {cluster!r}: expected HOST:PORT,N,K as in 127.0.0.1:9876,2,0")
     count, number = map(int, numbers)
     if number >= count:

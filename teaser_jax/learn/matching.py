@@ -73,8 +73,7 @@ def match(
     log_confidence = (
         2 * best - log_sum_exp(similarity, axis=1) - jnp.take(log_sum_exp(similarity, axis=0), counterpart)
     )
-    usable = src_mask & jnp.take(dst_mask, counterpart)
-    mask = usable
+    usable = mask = src_mask & jnp.take(dst_mask, counterpart)
     if mutual:
         mask &= jnp.take(jnp.argmax(lax.stop_gradient(similarity), axis=0), counterpart) == jnp.arange(n)
     confidence = jnp.where(usable, jnp.exp(jnp.where(usable, log_confidence, 0)), 0)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError, os_errors_named, replacing
 from teaser_jax.plots.style import BAD, DST, GOOD, INK, PALE, SRC, Axes, Figure, label, legend, new_figure
 from teaser_jax.studies.methods import LIMIT
@@ -111,7 +112,7 @@ def _ticks(axes: Axes, results: Results) -> None:
         axes.axvline(edge, color=PALE, linewidth=0.4)
 
 
-def _value(sweep: str, value: float) -> str:
+def _value(sweep: str, value: Number) -> str:
     return f"{value:g}" if sweep == MATCHES else f"{100 * value:g} %"
 
 

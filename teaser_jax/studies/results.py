@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError
 from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.methods import Row
@@ -49,7 +50,7 @@ class Results:
         return found
 
     @property
-    def values(self) -> list[float]:
+    def values(self) -> list[Number]:
         """The values of the cells that the table has, in the study's order."""
         there = {value for _, value in self._cells}
         return [v for v in self.study.values if written(v) in there]
@@ -61,11 +62,11 @@ class Results:
         order = [method.name for method in self.study.methods]
         return sorted(there, key=lambda name: order.index(name) if name in order else len(order))
 
-    def of(self, method: str, value: float) -> list[Row]:
+    def of(self, method: str, value: Number) -> list[Row]:
         """Return the rows of one method and cell."""
         return self._cells.get((method, written(value)), [])
 
-    def measured(self, method: str, value: float, column: str) -> np.ndarray:
+    def measured(self, method: str, value: Number, column: str) -> np.ndarray:
         """Return the numbers that a column has in one cell; runs that raised have none."""
         return np.array([row[column] for row in self.of(method, value) if column in row])
 
@@ -73,7 +74,7 @@ class Results:
         """Whether any row of a method has a number in a column."""
         return any(row["method"] == method and column in row for row in self.rows)
 
-    def success(self, method: str, value: float) -> float:
+    def success(self, method: str, value: Number) -> float:
         """Return the share of the runs of a cell that have an accepted answer; NaN without runs."""
         rows = self.of(method, value)
         return float(np.mean([self.study.right(row) for row in rows])) if rows else float("nan")

@@ -16,6 +16,7 @@ import jax
 from jax.sharding import Mesh
 
 from teaser_jax.batch.processes import all_of, check_agreement
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError, one_line, os_errors_named, replacing
 from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.figures import check_drawing, draw_study
@@ -32,7 +33,7 @@ PROTOCOL = 1  # raised when a study draws other problems for the same seed
 class Todo(NamedTuple):
     """A ``Todo`` lists the runs of one cell and method that a table lacks."""
 
-    value: float
+    value: Number
     method: Method
     numbers: list[int]
 
@@ -94,11 +95,11 @@ class _Work(NamedTuple):
     study: Study
     seed: int
     model: Model
-    cells: list[tuple[float, range]]
+    cells: list[tuple[Number, range]]
     methods: list[Method]
     mesh: Mesh | None
 
-    def trial(self, value: float, number: int = 0) -> Trial:
+    def trial(self, value: Number, number: int = 0) -> Trial:
         return self.study.trial(self.seed, value, number, self.model)
 
     def check(self) -> None:

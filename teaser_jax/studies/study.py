@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.trials import Draw, Model, StudyError, Trial, seed_of
@@ -55,17 +56,17 @@ class Study:
     figure: str
     title: str
     sweep: str
-    values: tuple[float, ...]
-    quick_values: tuple[float, ...]
+    values: tuple[Number, ...]
+    quick_values: tuple[Number, ...]
     draw: Draw
     methods: tuple[Method, ...]
     measures: tuple[Measure, ...]
     columns: tuple[str, ...]
     right: Callable[[Row], bool]
-    scale: float | None = 1.0
+    scale: Number | None = 1.0
     runs: int = 40
 
-    def cells(self, runs: int | None = None, *, quick: bool = False) -> list[tuple[float, range]]:
+    def cells(self, runs: int | None = None, *, quick: bool = False) -> list[tuple[Number, range]]:
         """List the values that are swept, each with the numbers of its runs.
 
         Args:
@@ -79,7 +80,7 @@ class Study:
         count = usual if runs is None else whole_number("runs", runs, 1, error=StudyError)
         return [(value, range(count)) for value in (self.quick_values if quick else self.values)]
 
-    def trial(self, seed: int, value: float, number: int, model: Model) -> Trial:
+    def trial(self, seed: int, value: Number, number: int, model: Model) -> Trial:
         """Draw one problem of a cell; the same for the same arguments, on every machine.
 
         Args:
@@ -98,6 +99,6 @@ class Study:
         return Trial(value, number, problem, self.scale)
 
 
-def below(**limits: float) -> Callable[[Row], bool]:
+def below(**limits: Number) -> Callable[[Row], bool]:
     """Make a test of rows: whether every one of these measures is a number below its limit."""
     return lambda row: all(row.get(column, np.nan) < limit for column, limit in limits.items())

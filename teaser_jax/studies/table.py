@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError
 
 TEXT = ("method", "error")
@@ -141,7 +142,7 @@ def _text(value: Any) -> str:
     return written(float(value))
 
 
-def written(number: float) -> str:
+def written(number: Number) -> str:
     """Write a number as tables hold it, so that what is read can be compared with what was meant."""
     return f"{number:.7g}"
 

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 from zlib import crc32
 
 from teaser_jax.files.models import read_shape
+from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import Problem
 from teaser_jax.register import host_problem
@@ -16,7 +17,7 @@ from teaser_jax.synthetic import Shape, SyntheticProblem
 
 
 class StudyError(ValueError):
-    """A study that cannot be run as asked. The message says what is known instead."""
+    """A ``StudyError`` says why a study cannot be run as asked, and what is known instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +47,10 @@ class Trial:
         scale: The known scale [-], or None where methods must find it.
     """
 
-    value: float
+    value: Number
     number: int
     problem: SyntheticProblem
-    scale: float | None = 1.0
+    scale: Number | None = 1.0
 
     def for_solver(self) -> Problem:
         """Return the matches without the truth, in float64 numpy."""
@@ -57,10 +58,10 @@ class Trial:
         return host_problem(p.src, p.dst, noise_bound=p.noise_bound, scale=self.scale)
 
 
-Draw: TypeAlias = Callable[[tuple[int, ...], float, Model], SyntheticProblem]
+Draw: TypeAlias = Callable[[tuple[int, ...], Number, Model], SyntheticProblem]
 
 
-def seed_of(study: str, seed: int, value: float, number: int) -> tuple[int, ...]:
+def seed_of(study: str, seed: int, value: Number, number: int) -> tuple[int, ...]:
     """Make the seed of one problem from its study, the user's seed, the cell, the run, and nothing else."""
     return seed, crc32(study.encode()), round(10_000 * value), number
 
