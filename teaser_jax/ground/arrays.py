@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 # dtypes without numbers, axes of vmap, whatever `jax.tree.map` returned.
 AnyArray: TypeAlias = Any
 
-Number: TypeAlias = float | int | np.number
+Number: TypeAlias = float | int | np.floating | np.integer
 
 CONCRETE = (np.ndarray, float, int, type(None))
 

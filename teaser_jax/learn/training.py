@@ -234,8 +234,8 @@ def _train(
         value, slope = jax.value_and_grad(loss)(parameters, drawn, taught)
         change, memory = optimizer.update(slope, memory, parameters)
         parameters = jax.tree.map(jnp.add, parameters, change)
-        known = drawn.truth is not None
-        angle = rotation_loss(taught.pose, drawn.truth) if known else jnp.full(batch, jnp.nan)
+        truth = drawn.truth
+        angle = jnp.full(batch, jnp.nan) if truth is None else rotation_loss(taught.pose, truth)
         return (parameters, memory), History(value, taught.trusted, angle)
 
     start = parameters, optimizer.init(parameters)

@@ -63,7 +63,7 @@ class Study:
     measures: tuple[Measure, ...]
     columns: tuple[str, ...]
     right: Callable[[Row], bool]
-    scale: Number | None = 1.0
+    scale: float | None = 1.0
     runs: int = 40
 
     def cells(self, runs: int | None = None, *, quick: bool = False) -> list[tuple[Number, range]]:

@@ -50,7 +50,7 @@ class Trial:
     value: Number
     number: int
     problem: SyntheticProblem
-    scale: Number | None = 1.0
+    scale: float | None = 1.0
 
     def for_solver(self) -> Problem:
         """Return the matches without the truth, in float64 numpy."""

@@ -178,7 +178,7 @@ def _right_matches(
 ) -> SyntheticProblem:
     if n < 1 or sigma < 0:
         raise ValueError(f"received n = {n} and sigma = {sigma}: expected n above 0, sigma 0 or above.")
-    bound = BOUND_PER_SIGMA * sigma if noise_bound is None else float(noise_bound)
+    bound = float(BOUND_PER_SIGMA * sigma if noise_bound is None else noise_bound)
     if bound < sigma:
         raise ValueError(f"noise_bound {bound} is below sigma {sigma}: most noise would be drawn again.")
     src = sample_model(rng, n, model)
