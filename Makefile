@@ -63,7 +63,7 @@ bench: $(PEERS) ## Run the benchmarks beside the peers, for instance: make bench
 
 studies: $(PEERS) ## Run the paper's studies, which takes hours, and write benchmarks/PAPER.md
 	@$(VENV)-peers/bin/teaser-jax study all --folder benchmarks/studies $(ARGS)
-	@$(VENV)-peers/bin/teaser-jax study report --folder benchmarks/studies -o benchmarks/PAPER.md
+	@$(VENV)-peers/bin/python -m benchmarks.paper benchmarks/studies -o benchmarks/PAPER.md
 
 oldest: ## Test against the oldest supported packages
 	@rm -rf $(VENV)-oldest && $(PYTHON) -m venv $(VENV)-oldest

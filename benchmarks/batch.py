@@ -1,12 +1,11 @@
-"""Many problems at once: throughput beside a loop over ``register`` and beside two processes of a peer."""
+"""Many problems at once: throughput beside a loop over ``register`` and beside processes of a peer."""
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,23 +13,33 @@ import numpy as np
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
+from benchmarks.crew import Crew
 from benchmarks.peers import PEERS
 from benchmarks.problems import Case, protocol
+from benchmarks.processes import available_cores
+from teaser_jax.studies.peers import Question
 
 # Matches, problems, what was wanted [problems/s] (None: three times the loop).
 CELLS = ((50, 1024, 45_000), (100, 1024, 14_000), (1000, 64, None))
 RATES = {50: (0.5, 0.8, 0.9), 100: (0.5, 0.8, 0.9), 1000: (0.95,)}
-PEER, PEER_PROCESSES = "kiss-matcher", 2
+PEER = "kiss-matcher"
 
 
-def seconds(works: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median times of works that take turns; each has run before."""
-    taken: dict[str, list[float]] = {name: [] for name in works}
+def seconds(
+    works: dict[str, Callable[[], Any]], rounds: int, own: dict[str, Callable[[], float]] | None = None
+) -> dict[str, float]:
+    """Median times of works that take turns; each has run before. ``own``: those that return their time."""
+
+    def timed(work: Callable[[], Any]) -> float:
+        start = time.perf_counter()
+        work()
+        return time.perf_counter() - start
+
+    clocks = {name: partial(timed, work) for name, work in works.items()} | (own or {})
+    taken: dict[str, list[float]] = {name: [] for name in clocks}
     for _ in range(rounds):
-        for name, work in works.items():
-            start = time.perf_counter()
-            work()
-            taken[name].append(time.perf_counter() - start)
+        for name, clock in clocks.items():
+            taken[name].append(clock())
     return {name: float(np.median(times)) for name, times in taken.items()}
 
 
@@ -44,12 +53,12 @@ def one_by_one(poses: tj.Pose) -> list[tj.Pose]:
     return [jax.tree.map(lambda x, k=k: x[k], poses) for k in range(len(poses.scale))]
 
 
-def by_peer(cases: list[Case]) -> list[tj.Pose]:
-    """A share of the problems, in one process."""
-    return [PEERS[PEER].solve(case) for case in cases]
+def ask_peer(case: Case) -> Question:
+    """The peer's question, in its process."""
+    return PEERS[PEER].ask(case)
 
 
-def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, pool: Any) -> dict:
+def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, crew: Crew | None) -> dict:
     """One size and share of wrong matches."""
     cases = list(protocol(n, rate, count))
     problems = [tj.host_problem(c.src, c.dst, noise_bound=c.noise_bound) for c in cases]
@@ -69,15 +78,13 @@ def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, pool:
         "loop": loop,
     }
     row: dict[str, Any] = {"cell": cases[0].cell, "batch": count, "wanted": wanted, "cold": cold}
-    if pool is not None:
-        shares = [cases[k::PEER_PROCESSES] for k in range(PEER_PROCESSES)]
-        answers = list(pool.map(by_peer, shares))
-        poses = [answers[k % PEER_PROCESSES][k // PEER_PROCESSES] for k in range(count)]
-        row["right_peer"] = right(cases, poses)
-        works["peer"] = lambda: list(pool.map(by_peer, shares))
-    taken = seconds(works, rounds)
+    own: dict[str, Callable[[], float]] = {}
+    if crew is not None:
+        row["right_peer"], row["peer_processes"] = right(cases, crew.take(cases)), len(crew.pipes)
+        own["peer"] = crew.seconds
+    taken = seconds(works, rounds, own)
     sizes = {"loop": len(some)}
-    row["rates"] = {name: sizes.get(name, count) / taken[name] for name in works}
+    row["rates"] = {name: sizes.get(name, count) / taken[name] for name in taken}
     row["right"] = right(cases, one_by_one(batch.pose))
     row["right_loop"] = right(some, [a.pose for a in alone])
     row["proved"] = float(np.mean(batch.clique_is_maximum))
@@ -87,33 +94,27 @@ def cell(n: int, rate: float, count: int, wanted: int | None, rounds: int, pool:
 
 def proved_on_device(stack: tj.Problem) -> np.ndarray:
     """Which cliques the device proves by itself, before the host's turn."""
-    from teaser_jax.packing import choices_of, pack_problem
-
-    from teaser_jax.register import bucket, until_clique
+    from teaser_jax.engine.packing import pack_problem
+    from teaser_jax.engine.programs import before_search
+    from teaser_jax.engine.sizes import size_of
 
     settings = tj.Settings()
     with jax.enable_x64(True):
-        sent = pack_problem(stack, settings, bucket(stack.src.shape[1]), None)
-        one = jax.jit(lambda x: until_clique(x, choices_of(settings), np.float32)[2])
+        sent, choices = pack_problem(stack, settings, size_of(stack)), jax.tree.structure(settings)
+        one = jax.jit(lambda x: before_search(x, choices, np.float32)[2])
         return np.asarray(jax.lax.map(one, sent, batch_size=64))
 
 
 def run(quick: bool) -> list[dict]:
-    """A row a cell; the peer's processes are started once."""
-    rows = []
-    # Started afresh: a process that has threads must not be forked. Threads of their own would wait for one
-    # another, a hundred times slower.
-    os.environ["OMP_NUM_THREADS"] = "1"
-    pool = ProcessPoolExecutor(PEER_PROCESSES, get_context("spawn")) if PEER in PEERS else None
-    try:
-        for n, count, wanted in CELLS:
-            for rate in RATES[n]:
-                share, rounds = (8, 2) if quick else (1, 9)
-                rows.append(cell(n, rate, count // share, wanted, rounds, pool))
-    finally:
-        if pool is not None:
-            pool.shutdown()
-    return rows
+    """A row a cell; the peer's processes, one a core, are started once."""
+    with ExitStack() as stack:
+        crew = stack.enter_context(Crew(ask_peer, available_cores())) if PEER in PEERS else None
+        share, rounds = (8, 2) if quick else (1, 9)
+        return [
+            cell(n, rate, count // share, wanted, rounds, crew)
+            for n, count, wanted in CELLS
+            for rate in RATES[n]
+        ]
 
 
 def metrics(rows: list[dict]) -> list[Metric]:
@@ -131,9 +132,12 @@ def metrics(rows: list[dict]) -> list[Metric]:
 
 def report(rows: list[dict]) -> str:
     """A line a cell."""
+    processes = rows[0].get("peer_processes", 0)
     text = [
         "Problems a second, warm: `solve_batch` of a stack and of a list, a loop over `register`, and "
-        f"{PEER} in {PEER_PROCESSES} processes, on the same problems, taking turns.",
+        f"{PEER} in {processes} processes, on the same problems, taking turns. The peer's processes hold "
+        "their problems in its own arrays beforehand, start together and look at their own clocks: nothing "
+        "is sent between processes in its time.",
         "",
         f"| cell | batch | stack | list | loop | {PEER} | wanted | reached | right: ours, loop, peer "
         "| proved on the device | first call [s] |",

@@ -41,7 +41,7 @@ def first(n: int, rate: float, unknown: bool) -> dict:
 
 def kernels() -> dict:
     """Seconds until the host's clique search stands ready, after teaser_jax was imported."""
-    from teaser_jax.stages.clique_search import load_kernels
+    from teaser_jax.stages.clique.exact import load_kernels
 
     start = time.perf_counter()
     load_kernels()

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from teaser_jax.stages.gnc import gnc_weights
 
 import teaser_jax as tj
 from benchmarks.baseline import Metric, said
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
+from teaser_jax.stages.rotation.gnc import gnc_weights
 
 BATCH, SIZE, WRONG = 256, 64, 0.5
 WANTED = 20_000  # problems a second
@@ -158,7 +158,7 @@ def awkward(kind: str, rng: np.random.Generator, n: int = 32) -> tuple[np.ndarra
         src[:] = src[0]
     if kind == "two points":
         src[::2], src[1::2] = src[0], src[1]
-    rotation = tj.synthetic.random_rotation(rng)
+    rotation = tj.synthetic.draw_rotation(rng)
     dst = src @ rotation.T + rng.uniform(-1, 1, 3)
     if kind == "mirrored":
         dst = dst * [-1, 1, 1]

@@ -21,18 +21,18 @@ def one(n: int, unknown: bool, method: str) -> dict | None:
 
     from benchmarks.peers import peers_for
     from benchmarks.problems import protocol
-    from benchmarks.speed import ours
+    from benchmarks.speed import ask_ours
 
     case = next(protocol(n, 0.8 if unknown else 0.95, 1, unknown=unknown))
-    solve = {OURS: lambda case: ours(case).pose, **peers_for(case)}[method]
+    question = {OURS: ask_ours(), **peers_for(case)}[method](case)
     jax.block_until_ready(jax.numpy.zeros(1) + 1)
     forget_peak()
     idle = peak_megabytes()
-    right = case.is_right(solve(case))  # compiles, too
+    right = case.is_right(question.answer())  # compiles, too
     first, seconds = peak_megabytes() - idle, []
     while len(seconds) < 3 or (sum(seconds) < 1 and len(seconds) < 50):
         start = time.perf_counter()
-        solve(case)
+        question.solve()
         seconds.append(time.perf_counter() - start)
     return {"seconds": float(np.median(seconds)), "megabytes": first, "right": right}
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from benchmarks.baseline import Metric, said
 from benchmarks.peers import peers_for
 from benchmarks.problems import Case, protocol, real_pairs
 from benchmarks.processes import available_cores, in_child
+from teaser_jax.studies.peers import Question
 
 CORES = (1, 2)
 OURS, GREEDY = "teaser_jax", "teaser_jax, clique='greedy'"
@@ -75,31 +77,37 @@ def ours(case: Case, settings: tj.Settings = DEFAULT) -> tj.Registration:
     return tj.register(case.src, case.dst, noise_bound=case.noise_bound, scale=case.scale, settings=settings)
 
 
+def ask_ours(settings: tj.Settings = DEFAULT) -> Callable[[Case], Question]:
+    """A case as we take it: as it is. What ``register`` makes of it counts."""
+    return lambda case: Question(partial(ours, case, settings), lambda result: result.pose)
+
+
 def warm(quick: bool) -> list[dict]:
     """A row a cell and method: median time of a call, right answers, proved cliques."""
     return [row for cell in cells() for row in _rows(cell, 1 if quick else cell.rounds)]
 
 
 def _rows(cell: Cell, rounds: int) -> Iterator[dict]:
-    greedy = tj.Settings(clique="greedy")
-    methods: dict[str, Callable[[Case], tj.Pose]] = {
-        OURS: lambda case: ours(case).pose,
-        GREEDY: lambda case: ours(case, greedy).pose,
+    asked: dict[str, Callable[[Case], Question]] = {
+        OURS: ask_ours(),
+        GREEDY: ask_ours(tj.Settings(clique="greedy")),
         **peers_for(cell.cases[0]),
     }
+    methods = {method: [ask(case) for case in cell.cases] for method, ask in asked.items()}
     right = {  # this compiles, too
-        method: sum(case.is_right(solve(case)) for case in cell.cases) for method, solve in methods.items()
+        method: sum(case.is_right(q.answer()) for case, q in zip(cell.cases, questions, strict=True))
+        for method, questions in methods.items()
     }
     proved = sum(bool(ours(case).solution.clique_is_maximum) for case in cell.cases)
     seconds: dict[str, list[float]] = {method: [] for method in methods}
     for _ in range(rounds):
-        for method, solve in methods.items():
+        for method, questions in methods.items():
             if sum(seconds[method]) > PATIENCE:
                 continue
             time.sleep(SETTLE)
-            for case in cell.cases:
+            for question in questions:
                 start = time.perf_counter()
-                solve(case)
+                question.solve()
                 seconds[method].append(time.perf_counter() - start)
     for method in methods:
         yield {

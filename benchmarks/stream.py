@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Iterator
 
@@ -13,6 +12,8 @@ from benchmarks.baseline import Metric, said
 from benchmarks.problems import Case, protocol
 from benchmarks.processes import in_child
 from benchmarks.speed import ours
+from teaser_jax.engine import sizes as sizes_room
+from teaser_jax.engine.programs import ON_ONE_DEVICE
 
 LEAST, MOST = 300, 6000
 WANTED_PROGRAMS, WANTED_PADDING = 8, 4 / 3
@@ -59,24 +60,23 @@ def day(quick: bool, warmed: bool) -> dict:
 
 
 def _programs() -> int:
-    return sys.modules["teaser_jax.register"].before_clique._cache_size()
+    return ON_ONE_DEVICE.before._cache_size()
 
 
 def padding(quick: bool) -> dict:
     """Time of calls in padded sizes over the time of the same calls in programs of their very size."""
-    register, times = sys.modules["teaser_jax.register"], []
-    padded = register.bucket
+    padded, times = sizes_room.padded_size, []
     for case in pairs(2 if quick else 12):
         seconds: dict = {padded: [], int: []}
         for repeat in range(2 if quick else 8):
             for bucket in seconds:
-                register.bucket = bucket
+                sizes_room.padded_size = bucket
                 start = time.perf_counter()
                 ours(case)
                 if repeat > 0:
                     seconds[bucket].append(time.perf_counter() - start)
         times.append([float(np.median(s)) for s in seconds.values()])
-    register.bucket = padded
+    sizes_room.padded_size = padded
     total = np.sum(times, axis=0)
     return {"part": "padding", "pairs": len(times), "ratio": float(total[0] / total[1])}
 

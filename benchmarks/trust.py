@@ -18,10 +18,11 @@ from benchmarks.problems import (
     real_pairs,
     without_correspondences,
 )  # fmt: skip
+from teaser_jax.settings import ExactClique
 
 NAMES = ("problems", "right", "ok", "right_and_ok")
 # Dense graphs of wrong matches would use any budget, and the answer is wrong whatever it is.
-HOPELESS = tj.Settings(clique_seconds=1.0)
+HOPELESS = tj.Settings(clique=ExactClique(seconds=1.0))
 
 
 def cases(quick: bool) -> Iterator[Case]:

@@ -1,56 +1,86 @@
-"""How good an answer is when the truth is known."""
+"""How good an answer is when the truth is known: errors of a pose, and of a set of inliers."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import namespace
+from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.pose import Pose
 
 
 class PoseErrors(NamedTuple):
-    """The three errors of a pose, each of the kind and batch shape of the poses compared."""
+    """``PoseErrors`` hold the three errors of a pose, each of the kind and batch shape of what was compared.
 
-    rotation: Any  # angle [rad]
-    translation: Any  # distance [length]
-    scale: Any  # absolute difference [-]
+    Attributes:
+        rotation: Angle between the rotations [rad].
+        translation: Distance between the translations [length].
+        scale: Absolute difference of the scales [-].
+    """
+
+    rotation: Float[AnyArray, "*batch"]
+    translation: Float[AnyArray, "*batch"]
+    scale: Float[AnyArray, "*batch"]
 
     @property
-    def rotation_deg(self) -> Any:
-        """The angle in degrees."""
+    def rotation_deg(self) -> Float[AnyArray, "*batch"]:
+        """The angle between the rotations in degrees, on the host."""
         return np.degrees(self.rotation)
 
 
 def errors(estimate: Pose, truth: Pose) -> PoseErrors:
-    """All three errors of a pose at once."""
+    """Measure the three errors of a pose at once.
+
+    Args:
+        estimate, truth: ``T_dst_src``, numpy or JAX, with any leading batch axes.
+
+    Gradients: as those of ``rotation_error``, ``translation_error`` and ``scale_error``.
+    """
     return PoseErrors(
         rotation_error(estimate, truth), translation_error(estimate, truth), scale_error(estimate, truth)
     )
 
 
-def rotation_error(estimate: Pose, truth: Pose) -> Any:
-    """Angle between the two rotations [rad]."""
+def rotation_error(estimate: Pose, truth: Pose) -> Float[AnyArray, "..."]:
+    """Measure the angle between two rotations [rad], accurate near 0 and near pi.
+
+    Gradients: NaN at 0 and pi, where the angle has kinks; ``learn.rotation_loss`` is zero there.
+    """
     between = so3.rotate(estimate.rotation.swapaxes(-1, -2), truth.rotation.swapaxes(-1, -2))
     return so3.rotation_angle(between)
 
 
-def translation_error(estimate: Pose, truth: Pose) -> Any:
-    """Distance between the two translations [length]."""
+def translation_error(estimate: Pose, truth: Pose) -> Float[AnyArray, "..."]:
+    """Measure the distance between two translations [length].
+
+    Gradients: NaN where the two are equal; ``learn.translation_loss`` is zero there.
+    """
     xp = namespace(estimate.translation, truth.translation)
     return xp.sqrt(xp.sum((estimate.translation - truth.translation) ** 2, axis=-1))
 
 
-def scale_error(estimate: Pose, truth: Pose) -> Any:
-    """Absolute difference of the scales [-]."""
+def scale_error(estimate: Pose, truth: Pose) -> Float[AnyArray, "..."]:
+    """Measure the absolute difference of two scales [-].
+
+    Gradients: the sign of the difference.
+    """
     return abs(estimate.scale - truth.scale)
 
 
 def precision_recall(found: Any, right: Any) -> tuple[float, float]:
-    """Share of found inliers that are right, and of right ones that are found; NaN of nothing."""
+    """Compare a set of inliers with the right matches.
+
+    Args:
+        found, right: (n,) masks, or anything that reads as one.
+
+    Returns:
+        The share of those found that are right, and the share of the right ones that are found [-]; NaN where
+        there are none to take a share of.
+    """
     found, right = np.asarray(found, bool), np.asarray(right, bool)
     both = float(np.sum(found & right))
     share = lambda total: both / total if total else float("nan")
-    return share(found.sum()), share(right.sum())
+    return float(share(found.sum())), float(share(right.sum()))

@@ -82,8 +82,8 @@ def solve_rotation(
         src, dst: (k, 3) vectors, row k with row k [length]; rows that are not finite are left out.
         noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length].
         method: ``"gnc"``, ``"global"`` or ``"sdp"``, or the record that one of them stands for
-            (``teaser_jax.settings.Gnc``, ``PairSearch``, ``Relaxation``); the last needs the extra ``sdp``, runs outside jit only
-            and takes up to 100 measurements: 2, 8 and 50 seconds for 20, 30 and 50.
+            (``teaser_jax.settings.Gnc``, ``PairSearch``, ``Relaxation``). The last needs the extra ``sdp``,
+            runs outside jit only and takes up to 100 measurements: 2, 8 and 50 seconds for 20, 30 and 50.
         cbar2: Truncation, c-bar squared [-].
         mask: (k,) rows to use.
         proof: How to certify, see ``certify_rotation``; None: not at all. Under vmap take ``"direct"``

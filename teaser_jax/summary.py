@@ -1,8 +1,8 @@
-"""What a person reads of an answer: the pose, what it rests on, and what is proved."""
+"""The words for an answer: its pose, what that rests on, and what is proved."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,43 +11,46 @@ from teaser_jax.certify.certificate import Certificate, CertificateStatus, Certi
 
 if TYPE_CHECKING:
     from teaser_jax.register import Registration
+else:
+    Registration = Any  # it imports this file
 
 
 def summary(result: Registration) -> str:
-    """A few lines that a person can read."""
+    """Tell a person about an answer: its status, its pose, what that rests on, and what to do."""
     s = result.solution
     n, inliers = len(result.inliers), int(result.inliers.sum())
+    excluded = f" ({int(s.excluded)} rows were not finite and left out)" if s.excluded else ""
     angle = np.degrees(so3.rotation_angle(result.pose.rotation))
+    quaternion = ", ".join(f"{q:.6f}" for q in result.pose.quat)
     x, y, z = result.pose.translation
-    proof = (
-        "proved maximum"
-        if s.clique_is_maximum
-        else "not proved maximum, "
-        f"at most {int(s.clique_upper_bound)} (see Settings.clique, ExactClique(nodes, seconds))"
-    )
-    searched = f"{int(s.clique_size)} matches agree pairwise, {proof}"
-    if s.clique_size == s.clique_upper_bound and not s.clique_is_maximum:
-        searched = f"not searched: all {int(s.clique_size)} usable matches were taken"
     rows = [
         f"{'ok' if result.ok else 'NOT OK'}: {result.status.name}",
-        f"  inliers      {inliers} of {n} matches"
-        + (f" ({int(s.excluded)} rows were not finite and left out)" if s.excluded else ""),
-        f"  clique       {searched}",
+        f"  inliers      {inliers} of {n} matches{excluded}",
+        f"  clique       {_clique(result)}",
         f"  scale        {float(result.pose.scale):.6g}",
-        f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) "
-        + "("
-        + ", ".join(f"{q:.6f}" for q in result.pose.quat)
-        + ")",
+        f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) ({quaternion})",
         f"  translation  ({x:.6g}, {y:.6g}, {z:.6g})",
-        f"  cost (6)     {float(s.cost):.6g}",
+        f"  cost         {float(s.cost):.6g}: each match adds (residual / noise bound)^2, but cbar2 at most",
         *_proofs(result),
         f"  {result.status.advice}",
     ]
     return "\n".join(rows)
 
 
+def _clique(result: Registration) -> str:
+    """Tell how many matches agree pairwise, and whether more could."""
+    s = result.solution
+    size, most = int(s.clique_size), int(s.clique_upper_bound)
+    if s.clique_is_maximum:
+        return f"{size} matches agree pairwise, proved maximum"
+    if size == most:
+        return f"not searched: all {size} usable matches were taken"
+    limits = "see Settings.clique, clique_seconds, clique_nodes"
+    return f"{size} matches agree pairwise, not proved maximum, at most {most} ({limits})"
+
+
 def _proofs(result: Registration) -> list[str]:
-    """One line for each thing that is proved, and none for what is not."""
+    """Tell what is proved, a line for each thing; what is not proved has none."""
     s, known = result.solution, result.problem.scale is not None
     votes = "each axis of the translation" if known else "scale and each axis of the translation"
     most, found = int(s.clique_upper_bound), int(result.inliers.sum())
@@ -56,13 +59,13 @@ def _proofs(result: Registration) -> list[str]:
         f"votes: {votes}, global optimum of its own problem",
         f"matches: no pose explains more than {most}{where}; this one explains {found}",
     ]
-    if "certificate" in vars(result):
-        lines.append(f"rotation: {said(result.certificate)}")
+    if result.has_certificate:
+        lines.append(f"rotation: {certificate_line(result.certificate)}")
     return [f"  {'proved' if i == 0 else '':<13}{line}" for i, line in enumerate(lines)]
 
 
-def said(certificate: Certificate) -> str:
-    """What a certificate proves, in one line."""
+def certificate_line(certificate: Certificate) -> str:
+    """Tell in one line what a certificate proves of a rotation."""
     c, status = certificate, CertificateStatus(int(certificate.status))
     measured = int(c.measurements)
     if not c.is_optimal:

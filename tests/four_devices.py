@@ -1,13 +1,12 @@
-"""Run by ``test_batch.py`` with four devices: 64 problems of 512 matches, against one device."""
+"""Run by ``test_solve_batch.py`` with four devices: 64 problems of 512 matches, against one device."""
 
 import json
 
 import jax
 import numpy as np
-from teaser_jax.batch.programs import programs
-from teaser_jax.packing import choices_of
 
 import teaser_jax as tj
+from teaser_jax.engine.programs import on_mesh
 
 
 def main() -> None:
@@ -20,7 +19,7 @@ def main() -> None:
     truth = jax.tree.map(lambda *x: np.stack(x), *[d.truth for d in drawn])
     right = int((np.degrees(tj.metrics.rotation_error(four.pose, truth)) < 5).sum())
     whole = jax.sharding.Mesh(np.array(jax.devices()), ("problems",))
-    compiled = programs(choices_of(tj.Settings()), whole)
+    compiled = on_mesh(jax.tree.structure(tj.Settings()), whole)
     count = compiled.before._cache_size() + compiled.after._cache_size()
     said = {"devices": len(jax.devices()), "same": same, "right": right, "compiled": count}
     print(json.dumps(said))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import time
+from functools import partial
 
 import pytest
 
 from benchmarks import baseline
 from benchmarks.baseline import Metric
+from benchmarks.crew import Crew
 from benchmarks.processes import forget_peak, in_child, peak_megabytes
+from teaser_jax.studies.peers import Question
 
 pytestmark = pytest.mark.skipif(
     not os.path.exists("/proc/self/clear_refs"), reason="benchmarks measure on Linux"
@@ -88,3 +91,23 @@ def test_the_peak_counts_from_when_it_was_forgotten():
     del held
     forget_peak()
     assert peak_megabytes() - before < 32
+
+
+def ask_to_sleep(how_long: float) -> Question:
+    time.sleep(0.5)  # making a question costs nothing
+    answer = (how_long, os.getpid(), os.environ["OMP_NUM_THREADS"])
+    return Question(partial(time.sleep, how_long), lambda _: answer)
+
+
+def test_a_crew_is_timed_inside_its_processes(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    with Crew(ask_to_sleep, processes=2) as crew:
+        answers = crew.take([0.05, 0.2, 0.1])
+        assert [a[0] for a in answers] == [0.05, 0.2, 0.1]
+        assert len({answers[0][1], answers[1][1], os.getpid()}) == 3
+        assert answers[0][1] == answers[2][1]
+        assert {a[2] for a in answers} == {"1"}
+        assert 0.2 <= min(crew.seconds() for _ in range(3)) < 0.3
+        assert crew.take([0.01])[0][0] == 0.01  # in place of those before
+        assert crew.seconds() < 0.1
+    assert os.environ["OMP_NUM_THREADS"] == "7"

@@ -15,6 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 import teaser_jax as tj
 from teaser_jax import cli, plots
+from teaser_jax.cli import register as register_command
 
 
 @pytest.fixture
@@ -137,7 +138,8 @@ def test_nothing_is_said_or_changed_when_something_cannot_be_written(
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(*((plots, "plot_registration", full) if draws else (cli, "write_pose", full)))
+    where = (plots, "plot_registration") if draws else (register_command, "write_pose")
+    monkeypatch.setattr(*where, full)
     output, plot = tmp_path / "T.txt", tmp_path / "p.png"
     for path in (output, plot):
         path.write_text("of an earlier run")
@@ -242,13 +244,16 @@ def test_any_arrays_end_in_an_exit_code(tmp_path, capsys, src, dst, bound):
         assert strictly(out)["ok"] is (code == 0)
 
 
+class OfNumpy(MemoryError):
+    """numpy raises a kind of its own, which says how much and not what to do."""
+
+
 @pytest.mark.parametrize(
     ("error", "message"),
     [
         (MemoryError(), "32 matches need more memory"),
         (MemoryError("pass pairs="), "pass pairs="),
-        (RuntimeError("Out of memory allocating 8 bytes"), "32 matches need more memory"),
-        (RuntimeError("RESOURCE_EXHAUSTED: no room"), "32 matches need more memory"),
+        (OfNumpy("Unable to allocate 9 GiB"), "32 matches need more memory"),
     ],
 )
 def test_memory_runs_out(matches, capsys, monkeypatch, error, message):
@@ -302,7 +307,7 @@ def test_version_and_help(capsys):
 def test_as_a_program(tmp_path):
     path = tmp_path / "broken.npz"
     path.write_bytes(b"PK\x03\x04")
-    command = [sys.executable, "-m", "teaser_jax.cli", "register", str(path), "--noise-bound", "1"]
+    command = [sys.executable, "-m", "teaser_jax", "register", str(path), "--noise-bound", "1"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stdout == ""

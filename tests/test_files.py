@@ -10,12 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import teaser_jax as tj
-from teaser_jax.files import TEXT, FileError, one_line, read_matches, write_pose
+from teaser_jax.files import FileError, read_matches, write_pose
+from teaser_jax.files.matches import TEXT
+from teaser_jax.ground.io import one_line
 
 RNG = np.random.default_rng(0)
 SRC, DST = RNG.normal(size=(2, 5, 3))
 TABLE = np.hstack([SRC, DST])
-POSE = tj.Pose(tj.synthetic.random_rotation(RNG), RNG.normal(size=3), np.asarray(1.7))
+POSE = tj.Pose(tj.synthetic.draw_rotation(RNG), RNG.normal(size=3), np.asarray(1.7))
 
 
 def archive(**arrays) -> bytes:

@@ -17,8 +17,7 @@ from jax.sharding import Mesh
 
 import teaser_jax as tj
 from teaser_jax.engine.batch import Solver
-from teaser_jax.engine.compaction import ALL_ROWS as NO_ROOM
-from teaser_jax.engine.compaction import rows_for as rooms
+from teaser_jax.engine.compaction import ALL_ROWS, rows_for
 from teaser_jax.engine.programs import MOST
 from teaser_jax.engine.sizes import Size
 from teaser_jax.synthetic import random_problem
@@ -53,7 +52,7 @@ def answers(many):
 
 
 def test_one_that_goes_its_own_way_leaves_the_others_in_place():
-    """A full run, of which a single problem has a larger clique than the rest and needs more room."""
+    """A full run, of which a single problem has a larger clique than the rest and needs more rows."""
     some = [problem(k, n=30, rate=0.0 if k == 1 else 0.6) for k in range(MOST)]
     found = tj.solve_batch(some)
     sizes = np.array([answer.clique_size for answer in found])
@@ -121,7 +120,7 @@ def test_order_neighbours_and_chunks_do_not_matter(many, answers):
 
 
 def test_large_problems_are_solved_in_turn_and_by_the_size_of_their_cliques():
-    """Cliques of 13 to 256 members: rooms of 32, 64, 256, and none."""
+    """Cliques of 13 to 256 members: 32, 64 and 256 rows, and all."""
     rates = (0.975, 0.9, 0.8, 0.5, 0.3)
     problems = [problem(k, n=512, rate=rates[k % 5]) for k in range(10)]
     expected = tj.solve_batch(problems)
@@ -147,10 +146,12 @@ def test_large_problems_are_solved_in_turn_and_by_the_size_of_their_cliques():
 )
 def test_room_for_every_clique(settings, offered):
     sizes = np.arange(257)
-    room = rooms(Size(256, None, True), tj.Settings(**settings), sizes)
-    assert np.all((room == NO_ROOM) | (room >= sizes))
-    assert (len(np.unique(room)) > 1) == offered
-    assert np.all(rooms(Size(256, 512, True), tj.Settings(**settings), sizes) == NO_ROOM)  # pairs are given
+    rows = rows_for(Size(256, None, True), tj.Settings(**settings), sizes)
+    assert np.all((rows == ALL_ROWS) | (rows >= sizes))
+    assert (len(np.unique(rows)) > 1) == offered
+    assert np.all(
+        rows_for(Size(256, 512, True), tj.Settings(**settings), sizes) == ALL_ROWS
+    )  # pairs are given
 
 
 def test_a_stack_comes_back_as_a_stack(many):

@@ -10,9 +10,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from teaser_jax.certify.subject import subject_on_host, traced_subject
 from teaser_jax.problem import clean
 
-traced = jax.jit(
-    lambda p, s, about, most: traced_subject(clean(p)[0], s, about, most), static_argnums=(2, 3)
-)
+traced = jax.jit(lambda p, s, about, most: traced_subject(clean(p)[0], s, about, most), static_argnums=(2, 3))
 
 
 def existing(subject) -> tuple[np.ndarray, np.ndarray]:

@@ -44,7 +44,7 @@ def test_the_model_fits_the_unit_cube_tightly():
 
 def test_rotations_and_balls_are_uniform():
     rng = np.random.default_rng(0)
-    rotations = np.stack([synthetic.random_rotation(rng) for _ in range(4000)])
+    rotations = np.stack([synthetic.draw_rotation(rng) for _ in range(4000)])
     np.testing.assert_allclose(
         rotations @ rotations.swapaxes(1, 2), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-12
     )
@@ -79,7 +79,7 @@ def test_no_rotation_or_reflection_maps_the_teapot_onto_itself():
     tree = cKDTree(pot)
     half_turns = [np.diag(signs) for signs in ((1, -1, -1), (-1, 1, -1), (-1, -1, 1), (1, -1, 1), (-1, 1, 1))]
     rng = np.random.default_rng(0)
-    angles = [(tj.so3.rotation_angle(r), r) for r in (synthetic.random_rotation(rng) for _ in range(200))]
+    angles = [(tj.so3.rotation_angle(r), r) for r in (synthetic.draw_rotation(rng) for _ in range(200))]
     spacing = tree.query(pot, k=2)[0][:, 1].max()
     for turn in half_turns + [r for angle, r in angles if angle > 0.3]:
         distances = tree.query(pot @ turn.T)[0]
@@ -101,13 +101,13 @@ def test_points_as_a_model_are_drawn_without_repeats():
     extent = np.ptp(model, axis=0).max()
     expected = np.sort((model - model.min(axis=0)) / extent, axis=0)
     np.testing.assert_allclose(np.sort(problem.src, axis=0), expected, atol=1e-12)
-    with pytest.raises(ValueError, match=r"40 points, fewer than n = 41.*Mesh"):
+    with pytest.raises(ValueError, match=r"40 points, fewer than n = 41.*Triangles"):
         synthetic.random_problem(0, n=41, model=model)
 
 
 def test_a_mesh_gives_any_number_of_points_by_area():
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
-    mesh = synthetic.Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+    mesh = synthetic.Triangles(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     points = synthetic.sample_model(np.random.default_rng(0), 4000, mesh)
     np.testing.assert_array_equal(points[:, 2], 0)
     np.testing.assert_allclose(

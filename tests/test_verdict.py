@@ -8,7 +8,7 @@ import pytest
 import teaser_jax as tj
 from teaser_jax.settings import ExactClique, Refinement, ScaleVote
 from teaser_jax.stages import verdict
-from teaser_jax.synthetic import random_problem, random_rotation
+from teaser_jax.synthetic import draw_rotation, random_problem
 
 BOUND = 0.05
 
@@ -20,7 +20,7 @@ def status(src, dst, **known) -> tj.Status:
 def moved(points, seed=0):
     """The points under a random rigid motion, with a little noise."""
     rng = np.random.default_rng(seed)
-    return points @ random_rotation(rng).T + rng.uniform(-1, 1, 3) + 0.003 * rng.normal(size=points.shape)
+    return points @ draw_rotation(rng).T + rng.uniform(-1, 1, 3) + 0.003 * rng.normal(size=points.shape)
 
 
 def cloud(n=60, seed=1):
@@ -173,7 +173,7 @@ def test_a_flat_cloud_mirrored_has_no_pose_either(flat, axis):
     # Its flat parts fit a rotation by themselves: those alone are no answer.
     rng = np.random.default_rng(axis)
     parts = np.concatenate([cloud(60) * [1, 1, 0.01], cloud(90, 2) * [1, 1, flat]])
-    src = parts @ random_rotation(rng).T
+    src = parts @ draw_rotation(rng).T
     mirror = np.where(np.arange(3) == axis, -1, 1)
     assert status(src, moved(src)) == tj.Status.OK
     assert status(src, moved(src * mirror)) == tj.Status.NO_CONSENSUS

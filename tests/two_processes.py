@@ -1,4 +1,4 @@
-"""Run by ``test_batch.py``, once a process: ADDRESS COUNT NUMBER."""
+"""Run by ``test_solve_batch.py``, once a process: ADDRESS COUNT NUMBER."""
 
 import json
 import sys

@@ -19,9 +19,9 @@ from teaser_jax.certify.pose import certify, on_host
 from teaser_jax.certify.whole_set import WholeSet, whole_set
 from teaser_jax.ground.arrays import is_traced
 from teaser_jax.ground.checks import whole_number
-from teaser_jax.refit import cascade_pose
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
+from teaser_jax.refit import cascade_pose
 from teaser_jax.solution import Solution
 
 

@@ -20,8 +20,7 @@ from teaser_jax.certify.subject import About, subject_on_host, traced_subject
 from teaser_jax.certify.traced import certify_traced
 from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
 from teaser_jax.ground.checks import one_of
-from teaser_jax.problem import clean
-from teaser_jax.problem import Problem
+from teaser_jax.problem import Problem, clean
 from teaser_jax.solution import Solution
 
 MAX_TRACED = 128  # measurements under jit, where sizes are static

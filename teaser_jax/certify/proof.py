@@ -24,8 +24,8 @@ from teaser_jax.certify.options import CertifyMethod
 from teaser_jax.certify.semidefinite import factorisation_error, reaches, smallest_eigenvalue
 from teaser_jax.certify.splitting import reference, split
 from teaser_jax.ground.loops import until_settled
-from teaser_jax.stages.rotation.quadratic_form import Measurements
 from teaser_jax.stages.rotation.pair_search import polish
+from teaser_jax.stages.rotation.quadratic_form import Measurements
 
 # Costs below this share of one outlier's are zero: relative gaps say nothing there.
 ABSOLUTE_TOLERANCE = 1e-6

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.ground import bits
+from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import cascade_pose
 from teaser_jax.solution import Solution

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 AnyArray: TypeAlias = Any  # numpy's on the host, JAX's on the device: what lives on both sides
+Number: TypeAlias = float | int | np.floating | np.integer
 
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ else:
             return not is_array or value.dtype == jax.dtypes.float0
 
     class Placeholder(metaclass=_MayStandForAnArray):
-        """What a record may hold where an array is meant, because JAX rebuilds records from other things, too.
+        """What a record may hold in the place of an array: JAX rebuilds records from other things, too.
 
         That is an axis of ``vmap``, a sharding, whatever ``jax.tree.map`` returned, and the tangents of truth
         values, which have no numbers. Shapes without numbers (``jax.ShapeDtypeStruct``) pass for arrays.
@@ -74,6 +76,39 @@ def safe_sqrt(squares: Float[Array, "*k"]) -> Float[Array, "*k"]:
     """The square root, with derivative zero (not infinite) at zero."""
     positive = squares > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
+
+
+def inner_products(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
+    """Multiply every row of ``a`` with every row of ``b``, in full precision on every backend.
+
+    Gradients: exact.
+    """
+    return jnp.matmul(a, b.T, precision=lax.Precision.HIGHEST)
+
+
+def squared_distances(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
+    """Square the distance of every row of ``a`` from every row of ``b``.
+
+    As |a|^2 + |b|^2 - 2 a.b, one product of matrices: rows should lie about the origin, or the squares of far
+    coordinates cancel.
+
+    Gradients: exact.
+    """
+    return jnp.sum(a * a, axis=1)[:, None] + jnp.sum(b * b, axis=1) - 2 * inner_products(a, b)
+
+
+def at_least_float32(values: AnyArray) -> Float[Array, "..."]:
+    """Convert to a JAX array of float32 or wider.
+
+    Integers would cut bounds, and half precision has no linear algebra.
+
+    Raises:
+        ValueError: For complex numbers.
+    """
+    values = jnp.asarray(values)
+    if jnp.issubdtype(values.dtype, jnp.complexfloating):
+        raise ValueError("complex numbers were received: points are real.")
+    return values.astype(jnp.promote_types(values.dtype, jnp.float32))
 
 
 def as_numpy(value: Any, name: str) -> np.ndarray:

@@ -6,6 +6,10 @@ from collections.abc import Iterable
 from numbers import Integral
 from typing import Any
 
+import numpy as np
+
+from teaser_jax.ground.arrays import is_traced
+
 BELOW = 2**31  # counts are 32-bit numbers on a device
 
 
@@ -50,3 +54,17 @@ def one_of(name: str, value: Any, allowed: Iterable[Any], *, expected: str = "on
     listed = list(allowed)
     if not any(value is known or (isinstance(value, str) and value == known) for known in listed):
         raise ValueError(f"{name} is {value!r}: expected {expected} {', '.join(map(repr, listed))}.")
+
+
+def check_positive(**numbers: Any) -> None:
+    """Raise ValueError for a number or an array that is not finite and above 0; tracers pass unseen.
+
+    Args:
+        numbers: The arguments by their names, which the error repeats.
+    """
+    for name, value in numbers.items():
+        if is_traced(value):
+            continue
+        given = np.asarray(value, float)
+        if not (np.isfinite(given).all() and (given > 0).all()):
+            raise ValueError(f"{name} is {value}: expected a finite number above 0.")

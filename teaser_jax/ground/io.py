@@ -59,6 +59,15 @@ def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
         raise FileError(f"{path}: {what} ({reason}).") from error
 
 
+@contextmanager
+def os_errors_named(path: Path, what: str) -> Iterator[None]:
+    """Turn an OSError of the block into a FileError that names the path and says ``what`` is wrong."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"{path}: {what}: {error.strerror or one_line(error)}.") from error
+
+
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     # numpy closes only files that it did not open; pickled objects would run code from the file.
     with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""Pieces for training loops: a teacher, losses, soft matching, a small network and a loop; all under jit."""
+"""What training loops call: a teacher, losses, soft matching, a small network and a loop; all under jit."""
 
 from teaser_jax.learn.losses import (
     inlier_loss,
@@ -14,6 +14,7 @@ from teaser_jax.learn.teacher import Labels, teacher
 from teaser_jax.learn.training import (
     History,
     Pairs,
+    Teach,
     match_scans,
     read_pairs,
     solver_labels,
@@ -22,7 +23,7 @@ from teaser_jax.learn.training import (
 )
 
 __all__ = [
-    "History", "Labels", "Matches", "Pairs", "Scan", "describe", "init_network", "inlier_loss",
+    "History", "Labels", "Matches", "Pairs", "Scan", "Teach", "describe", "init_network", "inlier_loss",
     "keypoint_loss", "match", "match_scans", "matching_loss", "point_loss", "read_pairs", "read_scan",
     "rotation_loss", "soft_counterparts", "solver_labels", "teacher", "train", "translation_loss",
     "truth_labels",

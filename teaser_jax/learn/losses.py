@@ -1,4 +1,4 @@
-"""Losses of poses, inliers, keypoints and descriptors. Each is a mean over what its mask leaves.
+"""Losses of poses, inliers, keypoints and descriptors: each is a mean over what its mask leaves.
 
 Means over nothing are 0, and so are their gradients. Poses may have leading batch axes. Masks are boolean and
 have the shape of what they mask; what they leave out may be anything, NaN too. A NaN that is not masked makes
@@ -10,30 +10,26 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Real
 
-from teaser_jax.learn.matching import (
-    as_float,
-    as_mask,
-    centred,
-    check_positive,
-    finite_rows,
-    least,
-    log_sum,
-    similarities,
+from teaser_jax.ground.arrays import AnyArray, Number, at_least_float32, inner_products, squared_distances
+from teaser_jax.ground.checks import check_positive
+from teaser_jax.ground.masked import (
+    about_mean,
+    harmless_rows,
+    log_sum_exp,
+    lowest_logit,
+    mask_or_all,
+    masked_mean,
 )
 from teaser_jax.pose import Pose
 
 
-def masked_mean(values: Float[Array, "..."], mask: Bool[Array, "..."] | None) -> Float[Array, ""]:
-    """The mean of the values under the mask; 0 if there are none."""
-    mask = as_mask(mask, values.shape)
-    count = jnp.sum(mask, dtype=values.dtype)
-    return jnp.sum(jnp.where(mask, values, 0)) / jnp.maximum(count, 1)
-
-
 def rotation_loss(pose: Pose, truth: Pose) -> Float[Array, "*batch"]:
-    """The angle between the rotations [rad].
+    """Measure the angle between two rotations [rad].
+
+    Args:
+        pose, truth: ``T_dst_src``, with any leading batch axes.
 
     Gradients: of length at most one a radian; zero at 0 and pi, where the angle has kinks.
     """
@@ -44,24 +40,38 @@ def rotation_loss(pose: Pose, truth: Pose) -> Float[Array, "*batch"]:
 
 
 def translation_loss(pose: Pose, truth: Pose) -> Float[Array, "*batch"]:
-    """The distance between the translations [length]. Gradients: exact; zero at 0."""
+    """Measure the distance between two translations [length].
+
+    Args:
+        pose, truth: ``T_dst_src``, with any leading batch axes.
+
+    Gradients: exact; zero at 0.
+    """
     return _distance(pose.translation - truth.translation)
 
 
 def point_loss(
     pose: Pose,
     truth: Pose,
-    points: Float[Array, "*batch n 3"],
-    mask: Bool[Array, "*batch n"] | None = None,
-) -> Float[Array, "*batch"]:
-    """How far the two poses carry the same source points apart, on average [length].
+    points: Real[AnyArray, "*batch n 3"],
+    mask: Bool[AnyArray, "*batch n"] | None = None,
+) -> Float[Array, "..."]:
+    """Measure how far two poses carry the same source points apart, on average [length].
 
-    Weighs rotation, translation and scale as they matter at the points, without a factor to choose.
+    That weighs rotation, translation and scale as they matter at the points, without a factor to choose.
+
+    Args:
+        pose, truth: ``T_dst_src``, with any leading batch axes.
+        points: Source points [length].
+        mask: Points that take part; None: all.
+
+    Raises:
+        ValueError: On a mask that is not boolean or has another shape than the points.
 
     Gradients: exact; zero for points that do not move.
     """
-    points = as_float(points)
-    mask = as_mask(mask, points.shape[:-1])
+    points = at_least_float32(points)
+    mask = mask_or_all(mask, points.shape[:-1])
     points = jnp.where(mask[..., None], points, 0)
     apart = _distance(pose.apply(points) - truth.apply(points))
     count = jnp.sum(mask, axis=-1, dtype=apart.dtype)
@@ -69,17 +79,25 @@ def point_loss(
 
 
 def inlier_loss(
-    logits: Float[Array, "*batch n"],
-    inliers: Bool[Array, "*batch n"],
-    mask: Bool[Array, "*batch n"] | None = None,
+    logits: Float[AnyArray, "*batch n"],
+    inliers: Bool[AnyArray, "*batch n"],
+    mask: Bool[AnyArray, "*batch n"] | None = None,
 ) -> Float[Array, ""]:
-    """Cross-entropy of inlier scores [nat], right and wrong matches weighed alike in total.
+    """Score inlier logits by their cross-entropy [nat], right and wrong matches weighed alike in total.
 
     Right matches are few: without the balance, calling all of them wrong would be nearly free.
 
+    Args:
+        logits: Log odds that a match is right [-].
+        inliers: The right matches.
+        mask: Matches that take part; None: all.
+
+    Raises:
+        ValueError: On inliers or a mask that are not boolean or of another shape than the logits.
+
     Gradients: exact.
     """
-    mask, inliers = as_mask(mask, logits.shape), as_mask(inliers, logits.shape)
+    mask, inliers = mask_or_all(mask, logits.shape), mask_or_all(inliers, logits.shape)
     logits = jnp.where(mask, logits, 0)
     right = masked_mean(-jax.nn.log_sigmoid(logits), mask & inliers)
     wrong = masked_mean(-jax.nn.log_sigmoid(-logits), mask & ~inliers)
@@ -87,16 +105,22 @@ def inlier_loss(
 
 
 def keypoint_loss(
-    src: Float[Array, "*batch n 3"],
-    dst: Float[Array, "*batch n 3"],
+    src: Real[AnyArray, "*batch n 3"],
+    dst: Real[AnyArray, "*batch n 3"],
     pose: Pose,
     *,
-    noise_bound: float | Float[Array, "..."],
-    mask: Bool[Array, "*batch n"] | None = None,
+    noise_bound: Number | Float[AnyArray, "..."],
+    mask: Bool[AnyArray, "*batch n"] | None = None,
 ) -> Float[Array, ""]:
-    """How badly predicted keypoints agree with a pose: the mean of r^2 / (beta^2 + r^2) [-], from 0 to 1.
+    """Measure how badly keypoints agree with a pose: the mean of r^2 / (beta^2 + r^2) [-], from 0 to 1.
 
-    Wrong matches saturate, so they pull little. ``src`` and ``dst`` are keypoints that a network placed.
+    Wrong matches saturate, so they pull little.
+
+    Args:
+        src, dst: Keypoints that a network placed, row i with row i [length].
+        pose: ``T_dst_src``.
+        noise_bound: beta, one number or one a keypoint [length].
+        mask: Keypoints that take part; None: all.
 
     Raises:
         ValueError: On shapes that do not fit, or a ``noise_bound`` that is not above 0.
@@ -108,8 +132,8 @@ def keypoint_loss(
     if src.shape != dst.shape:
         raise ValueError(f"keypoints have shapes {src.shape} and {dst.shape}: expected the same.")
     check_positive(noise_bound=noise_bound)
-    mask = as_mask(mask, src.shape[:-1])
-    src, dst = (jnp.where(mask[..., None], as_float(x), 0) for x in (src, dst))
+    mask = mask_or_all(mask, src.shape[:-1])
+    src, dst = (jnp.where(mask[..., None], at_least_float32(x), 0) for x in (src, dst))
     difference = (dst - pose.apply(src)) / jnp.asarray(noise_bound, src.dtype)[..., None]
     # So far away the cost is 1 to all digits, and its square must not overflow.
     most = jnp.finfo(difference.dtype).max ** 0.25
@@ -119,18 +143,18 @@ def keypoint_loss(
 
 
 def matching_loss(
-    src_descriptors: Float[Array, "n d"],
-    dst_descriptors: Float[Array, "m d"],
-    src: Float[Array, "n 3"],
-    dst: Float[Array, "m 3"],
+    src_descriptors: Float[AnyArray, "n d"],
+    dst_descriptors: Float[AnyArray, "m d"],
+    src: Float[AnyArray, "n 3"],
+    dst: Float[AnyArray, "m 3"],
     pose: Pose,
     *,
-    radius: float,
-    temperature: float = 0.1,
-    src_mask: Bool[Array, " n"] | None = None,
-    dst_mask: Bool[Array, " m"] | None = None,
+    radius: Number | Float[AnyArray, ""],
+    temperature: Number | Float[AnyArray, ""] = 0.1,
+    src_mask: Bool[AnyArray, " n"] | None = None,
+    dst_mask: Bool[AnyArray, " m"] | None = None,
 ) -> Float[Array, ""]:
-    """Descriptors of the same place should be alike, given a pose: a contrastive loss [nat].
+    """Ask that descriptors of the same place, given a pose, are alike: a contrastive loss [nat].
 
     Target points within ``radius`` of where the pose takes a source point are the same place, those beyond
     twice the radius are others, and between the two nothing is asked. For each point that has a counterpart:
@@ -138,10 +162,10 @@ def matching_loss(
 
     Args:
         src_descriptors, dst_descriptors: Rows of length 1, from ``describe``, for instance.
-        src, dst: Their points.
+        src, dst: Their points [length].
         pose: ``T_dst_src``, true or from the ``teacher``.
         radius: See above [length].
-        temperature: Difference of similarity that counts.
+        temperature: Difference of similarity that counts [-].
         src_mask, dst_mask: Points that take part; None: all. Those that are not finite, or whose descriptor
             is not, do not.
 
@@ -153,31 +177,36 @@ def matching_loss(
     References: van den Oord et al., 2018 (InfoNCE); Khosla et al., NeurIPS 2020 (many positives).
     """
     check_positive(radius=radius, temperature=temperature)
-    src, dst, pose = lax.stop_gradient((src, dst, pose))
-    src_descriptors, src_mask = finite_rows(src_descriptors, src_mask)
-    dst_descriptors, dst_mask = finite_rows(dst_descriptors, dst_mask)
+    src_descriptors, src_mask = harmless_rows(src_descriptors, src_mask)
+    dst_descriptors, dst_mask = harmless_rows(dst_descriptors, dst_mask)
+    same, asked = _same_place(*lax.stop_gradient((pose, src, dst)), src_mask, dst_mask, radius)
+    likeness = inner_products(src_descriptors, dst_descriptors) / temperature
+    good, every = (jnp.where(some, likeness, lowest_logit(likeness)) for some in (same, asked))
+
+    def one_way(axis: int) -> Array:
+        missed = log_sum_exp(every, axis=axis) - log_sum_exp(good, axis=axis)
+        return masked_mean(missed, jnp.any(same, axis=axis))
+
+    return 0.5 * (one_way(0) + one_way(1))
+
+
+def _same_place(
+    pose: Pose, src: Array, dst: Array, src_mask: Array, dst_mask: Array, radius: AnyArray
+) -> tuple[Bool[Array, "n m"], Bool[Array, "n m"]]:
+    """Tell which pairs of points are the same place under a pose, and which of all pairs are asked about."""
     src_mask &= jnp.all(jnp.isfinite(src), axis=1)
     dst_mask &= jnp.all(jnp.isfinite(dst), axis=1)
     # About one middle: squares of far coordinates would cancel.
-    both = centred(jnp.concatenate([pose.apply(src), dst]), jnp.concatenate([src_mask, dst_mask]))
-    moved, dst = both[: len(src)], both[len(src) :]
-    either = src_mask[:, None] & dst_mask
-    distance2 = (
-        jnp.sum(moved * moved, axis=1)[:, None] + jnp.sum(dst * dst, axis=1) - 2 * similarities(moved, dst)
-    )
-    same = either & (distance2 < radius**2)
-    asked = same | (either & (distance2 > 4 * radius**2))
-    likeness = similarities(src_descriptors, dst_descriptors) / temperature
-    good, every = (jnp.where(some, likeness, least(likeness)) for some in (same, asked))
-
-    def side(axis: int) -> Array:
-        return masked_mean(log_sum(every, axis=axis) - log_sum(good, axis=axis), jnp.any(same, axis=axis))
-
-    return 0.5 * (side(0) + side(1))
+    together = jnp.concatenate([pose.apply(src), dst]), jnp.concatenate([src_mask, dst_mask])
+    near_origin = about_mean(*together)
+    distance2 = squared_distances(near_origin[: len(src)], near_origin[len(src) :])
+    both = src_mask[:, None] & dst_mask
+    same = both & (distance2 < radius**2)
+    return same, same | (both & (distance2 > 4 * radius**2))
 
 
 def _distance(x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-    """The length, with gradient zero at zero; NaN where there is one."""
+    """Measure lengths with gradient zero at zero; a NaN stays NaN."""
     length2 = jnp.sum(x * x, axis=-1)
     some = length2 != 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, length2, 1)), 0)

@@ -9,29 +9,31 @@ Rings are matrices and means are products of matrices, which any device does wel
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, Real
 
-from teaser_jax.learn.matching import as_float, as_mask, centred, check_positive, similarities
+from teaser_jax.ground.arrays import AnyArray, Number, at_least_float32, squared_distances
+from teaser_jax.ground.checks import check_positive
+from teaser_jax.ground.masked import about_mean, mask_or_all
 
 BINS = 5
 PREFERENCE = 0.01  # for the direction to the sensor as a normal, against a spread of the radius squared
 LEVELS = (0.25, 0.5, 1.0)  # neighbourhoods and rings, as shares of the reach
 FEATURES = len(LEVELS) * 4 * BINS
-Parameters = dict[str, Any]
+Parameters: TypeAlias = dict[str, Any]
 
 
 class Scan(NamedTuple):
-    """A scan as the network takes it.
+    """A ``Scan`` holds points as the network takes them, with what their neighbourhoods say.
 
     Attributes:
-        points: [length].
-        features: What each neighbourhood says; the same in every frame.
+        points: The points of the scan, in its own frame [length].
+        features: What each neighbourhood says, the same in every frame [-].
         mask: Points that exist; padding is False.
         reach: The largest distance of a neighbour [length].
     """
@@ -43,17 +45,17 @@ class Scan(NamedTuple):
 
 
 def read_scan(
-    points: Float[Array, "n 3"],
-    viewpoint: Float[Array, "3"],
-    mask: Bool[Array, " n"] | None = None,
+    points: Real[AnyArray, "n 3"],
+    viewpoint: Real[AnyArray, "3"],
+    mask: Bool[AnyArray, " n"] | None = None,
     *,
-    reach: float | Float[Array, ""] = 0.32,
+    reach: Number | Float[AnyArray, ""] = 0.32,
 ) -> Scan:
-    """The geometry around every point: normals towards the sensor, and histograms of pairs.
+    """Read the geometry around every point of a scan: normals towards the sensor, and histograms of pairs.
 
     Args:
         points: A scan [length].
-        viewpoint: Where the sensor stood, in the frame of the scan; it tells outside from inside.
+        viewpoint: Where the sensor stood, in the frame of the scan [length]; it tells outside from inside.
         mask: Points that exist; None: all. Points that are not finite, and those without a neighbour within
             reach, of which nothing can be said, are masked.
         reach: How far a neighbour can be [length]: a third of an object.
@@ -65,14 +67,16 @@ def read_scan(
 
     References: Drost et al., CVPR 2010 (pairs of oriented points); Rusu et al., ICRA 2009 (histograms).
     """
-    points, viewpoint = as_float(points), as_float(viewpoint)
+    points, viewpoint = at_least_float32(points), at_least_float32(viewpoint)
     if points.ndim != 2 or points.shape[1] != 3 or viewpoint.shape != (3,):
         raise ValueError(
             f"points have shape {points.shape} and the viewpoint {viewpoint.shape}: expected (n, 3) and "
             "(3,); use jax.vmap for batches."
         )
     check_positive(reach=reach)
-    return _read_scan(points, viewpoint, as_mask(mask, points.shape[:1]), jnp.asarray(reach, points.dtype))
+    return _read_scan(
+        points, viewpoint, mask_or_all(mask, points.shape[:1]), jnp.asarray(reach, points.dtype)
+    )
 
 
 @jax.jit
@@ -86,26 +90,27 @@ def _read_scan(points: Array, viewpoint: Array, mask: Array, reach: Array) -> Sc
     mask &= jnp.any(pairs & (distance < reach), axis=1)
     radius = LEVELS[0] * reach
     normals = _normals(points, viewpoint, mask, pairs & (distance < radius), radius)
-    direction = difference / jnp.where(distance > 0, distance, 1)[..., None]
-    cosines = (
-        jnp.einsum("ijk,ik->ij", direction, normals),
-        jnp.einsum("ijk,jk->ij", direction, normals),
-        normals @ normals.T,
-    )
-    angles = jnp.concatenate([_soft_bins(c, -1.0, 1.0) for c in cosines], axis=2)
-    found = []
+    angles = _angles(difference, distance, normals)
+    features = []
     for level in LEVELS:
         near = (pairs & (distance < level * reach)).astype(points.dtype)
         near = near / jnp.maximum(jnp.sum(near, axis=1, keepdims=True), 1)
         lengths = _soft_bins(distance / (level * reach), 0.0, 1.0)
-        found += [jnp.einsum("ij,ijm->im", near, x) for x in (angles, lengths)]
-    return Scan(points, jnp.concatenate(found, axis=1), mask, reach)
+        features += [jnp.einsum("ij,ijm->im", near, x) for x in (angles, lengths)]
+    return Scan(points, jnp.concatenate(features, axis=1), mask, reach)
 
 
 def init_network(
     key: PRNGKeyArray, *, width: int = 64, messages: int = 24, layers: int = 3, size: int = 24
 ) -> Parameters:
-    """Random weights, as a pytree: ``width`` numbers a point inside, ``size`` in its descriptor.
+    """Draw random weights for ``describe``, as a pytree.
+
+    Args:
+        key: Decides the weights.
+        width: Numbers that the network keeps of a point, from layer to layer.
+        messages: Numbers that a point sends to its neighbours in each layer.
+        layers: How often points hear one another; with 0 each knows its own neighbourhood only.
+        size: Numbers in a descriptor.
 
     Raises:
         ValueError: If one of these numbers is below 1 (``layers``: below 0).
@@ -131,9 +136,15 @@ def init_network(
 
 
 def describe(parameters: Parameters, scan: Scan) -> Float[Array, "n d"]:
-    """Descriptors of length 1 (to 1e-6), the same in every frame; those of masked points mean nothing.
+    """Describe every point of one scan by a vector of length 1 (to 1e-6), the same in every frame.
 
-    Gradients: exact in the parameters.
+    Descriptors of masked points mean nothing.
+
+    Args:
+        parameters: From ``init_network`` or ``train``.
+        scan: One scan from ``read_scan``; ``jax.vmap`` takes stacks.
+
+    Gradients: exact in the parameters; none in the scan.
     """
     rings = _rings(scan)
     state = _normalise(_perceptron(parameters["enter"], _normalise(scan.features)))
@@ -167,14 +178,13 @@ def _normalise(x: Array) -> Array:
 
 
 def _rings(scan: Scan) -> list[tuple[Array, Array]]:
-    """Who is in which ring of whom, as 0 and 1, and one over how many: the mean is a product and a factor."""
-    x = centred(lax.stop_gradient(scan.points), scan.mask)
-    length2 = jnp.sum(x * x, axis=1)
-    distance2 = length2[:, None] + length2 - 2 * similarities(x, x)
-    found, inner = [], jnp.asarray(-jnp.inf, x.dtype)
+    """Tell who is in which ring of whom, as 0 and 1, and one over how many: factors that make a mean."""
+    near_origin = about_mean(lax.stop_gradient(scan.points), scan.mask)
+    distance2 = squared_distances(near_origin, near_origin)
+    found, inner = [], jnp.asarray(-jnp.inf, distance2.dtype)
     for level in LEVELS:
         outer = (level * scan.reach) ** 2
-        ring = ((distance2 >= inner) & (distance2 < outer) & scan.mask).astype(x.dtype)
+        ring = ((distance2 >= inner) & (distance2 < outer) & scan.mask).astype(distance2.dtype)
         found.append((ring, 1 / jnp.maximum(jnp.sum(ring, axis=1, keepdims=True), 1)))
         inner = outer
     return found
@@ -183,13 +193,13 @@ def _rings(scan: Scan) -> list[tuple[Array, Array]]:
 def _normals(
     points: Array, viewpoint: Array, mask: Array, near: Bool[Array, "n n"], radius: Array | float
 ) -> Float[Array, "n 3"]:
-    """The direction in which a neighbourhood spreads least, on the side of the sensor.
+    """Find the direction in which each neighbourhood spreads least, on the side of the sensor.
 
     Two or three neighbours leave that open: where they do, the direction to the sensor is preferred.
     """
     weight = (near | jnp.eye(len(points), dtype=bool)).astype(points.dtype)
     count = jnp.sum(weight, axis=1, keepdims=True)
-    near_origin = centred(points, mask)  # so that squares do not cancel
+    near_origin = about_mean(points, mask)  # so that squares do not cancel
     product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
     mean = product(weight, near_origin) / count
     outer = (near_origin[:, :, None] * near_origin[:, None, :]).reshape(len(points), 9)
@@ -202,7 +212,18 @@ def _normals(
     return jnp.where(outwards < 0, -normals, normals)
 
 
+def _angles(difference: Array, distance: Array, normals: Array) -> Float[Array, "n n m"]:
+    """Bin the angles of the two normals of a pair with the line between them, and with each other."""
+    direction = difference / jnp.where(distance > 0, distance, 1)[..., None]
+    cosines = (
+        jnp.einsum("ijk,ik->ij", direction, normals),
+        jnp.einsum("ijk,jk->ij", direction, normals),
+        normals @ normals.T,
+    )
+    return jnp.concatenate([_soft_bins(c, -1.0, 1.0) for c in cosines], axis=2)
+
+
 def _soft_bins(x: Array, low: float, high: float) -> Array:
-    """How close a number is to each of a few places, as Gaussian bumps that overlap."""
+    """Say how close numbers are to each of a few places, by Gaussian bumps that overlap."""
     places, step = jnp.linspace(low, high, BINS, dtype=x.dtype), (high - low) / (BINS - 1)
     return jnp.exp(-0.75 * ((x[..., None] - places) / step) ** 2)

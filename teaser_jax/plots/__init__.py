@@ -6,23 +6,18 @@ matplotlib state is read for layout or changed, and any backend will do. Save on
 extra ``viz`` and loads when a function is called.
 """
 
+from teaser_jax.plots.answer import plot_registration
 from teaser_jax.plots.learning import plot_errors, plot_slopes, plot_training
 from teaser_jax.plots.proofs import plot_bounds, plot_certified, plot_landscape
 from teaser_jax.plots.stages import (
-    BAD,
-    DST,
-    GOOD,
-    INK,
-    PALE,
-    SRC,
     plot_clique,
     plot_graph,
     plot_refinement,
-    plot_registration,
     plot_residuals,
     plot_translation,
     plot_trims,
 )
+from teaser_jax.plots.style import BAD, DST, GOOD, INK, PALE, SRC
 
 __all__ = [
     "BAD", "DST", "GOOD", "INK", "PALE", "SRC",

@@ -3,34 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.certify.certificate import Certificate, CertificateStatus
-from teaser_jax.plots.stages import BAD, DST, GOOD, INK, PALE, SRC, label, legend, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from teaser_jax.ground.arrays import AnyArray, Number
+from teaser_jax.plots.style import (
+    BAD,
+    DST,
+    GOOD,
+    INK,
+    PALE,
+    SRC,
+    Figure,
+    label,
+    legend,
+    new_figure,
+    without_spines,
+)
 
 AXES = {"x": SRC, "y": DST, "z": INK}
 
 
 def plot_landscape(
-    src: Float[np.ndarray, "k 3"],
-    dst: Float[np.ndarray, "k 3"],
+    src: Float[AnyArray, "k 3"],
+    dst: Float[AnyArray, "k 3"],
     certificate: Certificate,
     *,
     noise_bound: Any,
-    cbar2: float = 1.0,
+    cbar2: Number = 1.0,
 ) -> Figure:
-    """The cost of turning away from the certified rotation, and the level below which nothing can lie.
+    """Draw the cost of turning away from a certified rotation, and the level below which nothing can lie.
 
-    Left the whole circle about each axis, right the neighbourhood of the rotation.
+    Left the whole circle about each axis, right the neighbourhood of the rotation. No line enters the green
+    band, and where the green dot stands on its edge, the rotation is optimal.
 
     Args:
-        src, dst, noise_bound, cbar2: The measurements of the certificate.
+        src, dst: The vectors that were measured, as the certificate got them [length].
+        noise_bound: Their largest errors, one number or one each [length].
+        cbar2: Truncation [-].
         certificate: Its polished rotation stands at zero degrees.
 
     Raises:
@@ -61,8 +74,9 @@ def plot_landscape(
 
 def _costs_about(
     axis: int, degrees: np.ndarray, src: np.ndarray, dst: np.ndarray, certificate: Certificate,
-    bound: np.ndarray, cbar2: float,
+    bound: np.ndarray, cbar2: Number,
 ) -> np.ndarray:  # fmt: skip
+    """Compute the truncated cost (12) of the certified rotation, turned about one axis by some angles."""
     from scipy.spatial.transform import Rotation
 
     vectors = np.deg2rad(degrees)[:, None] * np.eye(3)[axis]
@@ -73,7 +87,7 @@ def _costs_about(
 
 
 def plot_certified(counts: Mapping[str, tuple[int, int]]) -> Figure:
-    """How many answers of each kind are certified: a certificate says optimal, and not right.
+    """Draw how many answers of each kind are certified, as shares of a bar: that says optimal, not right.
 
     Args:
         counts: For each kind of problem the number of certified answers and of all.
@@ -92,20 +106,19 @@ def plot_certified(counts: Mapping[str, tuple[int, int]]) -> Figure:
     axes.set_xlim(0, 1.18)
     axes.set_xticks([0, 0.5, 1], ["0", "50 %", "100 %"], fontsize=8)
     axes.invert_yaxis()
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
+    without_spines(axes, "top", "right", "left")
     legend(figure, {"certified": GOOD, "not certified": PALE})
     return figure
 
 
 def plot_bounds(
-    errors: Mapping[str, tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]], *, unit: str = "deg"
+    errors: Mapping[str, tuple[Float[AnyArray, " p"], Float[AnyArray, " p"]]], *, unit: str = "deg"
 ) -> Figure:
-    """True errors against their bounds, on logarithmic axes: nothing may lie above the diagonal.
+    """Draw true errors against their bounds, on logarithmic axes: no dot may lie above the diagonal.
 
     Args:
-        errors: For each kind of bound the true errors and the bounds.
-        unit: For the axes.
+        errors: For each kind of bound the true errors and the bounds, in one unit.
+        unit: The name of that unit, for the axes.
 
     Raises:
         ImportError: If matplotlib is missing.
@@ -125,7 +138,6 @@ def plot_bounds(
     axes.set_xlabel(f"bound [{unit}]", fontsize=9, color=INK)
     axes.set_ylabel(f"true error [{unit}]", fontsize=9, color=INK)
     axes.tick_params(labelsize=8, colors=INK)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    without_spines(axes, "top", "right")
     legend(figure, colors)
     return figure

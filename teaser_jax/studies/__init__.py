@@ -4,18 +4,18 @@
 The command line is ``teaser-jax study``. The extra ``studies`` draws the figures and reads models.
 """
 
-from teaser_jax.studies.catalogue import Measure, Study, studies
+from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.figures import draw_study
 from teaser_jax.studies.methods import Method
-from teaser_jax.studies.paper import write_report
 from teaser_jax.studies.results import Results, read_results
 from teaser_jax.studies.run import run_study
 from teaser_jax.studies.shards import draw_trials, read_trials, save_trials
+from teaser_jax.studies.study import Measure, Study
 from teaser_jax.studies.table import read_table
 from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, read_model
 
 __all__ = [
     "TEAPOT", "Measure", "Method", "Model", "Results", "Study", "StudyError", "Trial", "draw_study",
     "draw_trials", "read_model", "read_results", "read_table", "read_trials", "run_study", "save_trials",
-    "studies", "write_report",
+    "studies",
 ]  # fmt: skip

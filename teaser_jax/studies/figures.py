@@ -4,18 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from teaser_jax.files import FileError, whole
-from teaser_jax.plots.stages import BAD, DST, GOOD, INK, PALE, SRC, label, legend, new_figure
-from teaser_jax.studies.catalogue import LABELS, MATCHES, Measure
+from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.io import FileError, os_errors_named, replacing
+from teaser_jax.plots.style import (
+    BAD,
+    DST,
+    GOOD,
+    INK,
+    PALE,
+    SRC,
+    Axes,
+    Figure,
+    label,
+    legend,
+    new_figure,
+)
 from teaser_jax.studies.methods import LIMIT
 from teaser_jax.studies.results import PAGE, PICTURE, TABLE, Results, read_results
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from teaser_jax.studies.study import LABELS, MATCHES, Measure
 
 FLOOR = 1e-5  # below it a logarithmic axis says no more
 OUR_COLORS = (GOOD, DST, "#7fb0e0", "#17415f", "#8fd0ab", "#5b7f95")
@@ -25,6 +35,14 @@ OTHER_COLORS = (SRC, BAD, "#8e5ea2", "#9c6b3f", "#d9a520", "#d17fa8", INK)
 def draw_study(place: str | Path) -> tuple[Path, Path]:
     """Draw ``figure.png`` (matplotlib) and ``figure.html`` (plotly, self-contained) beside the table.
 
+    Both show box plots of every measure by method and cell, and the share of right answers.
+
+    Args:
+        place: The folder of the study.
+
+    Returns:
+        The two files.
+
     Raises:
         FileError: As ``read_results``; where the table has no row, or figures cannot be written.
         ImportError: Without the extra ``studies``.
@@ -33,13 +51,11 @@ def draw_study(place: str | Path) -> tuple[Path, Path]:
     results = read_results(place)
     if not results.rows:
         raise FileError(f"{place / TABLE}: has no row yet: run the study first.")
-    try:
-        with whole(place / PICTURE) as partial:
+    with os_errors_named(place, "figures cannot be written"):
+        with replacing(place / PICTURE) as partial:
             _picture(results).savefig(partial, dpi=110)
-        with whole(place / PAGE) as partial:
+        with replacing(place / PAGE) as partial:
             partial.write_text(_page(results), encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{place}: figures cannot be written: {error.strerror or error}.") from error
     return place / PICTURE, place / PAGE
 
 
@@ -50,14 +66,14 @@ def check_drawing() -> None:
 
 
 def _panels(results: Results) -> Iterator[tuple[Measure, list[str]]]:
-    """Each measure with the methods that have it."""
+    """List each measure with the methods that have it."""
     for measure in results.study.measures:
         having = [name for name in results.methods if results.has(name, measure.column)]
         if having:
             yield measure, having
 
 
-def _picture(results: Results) -> Any:
+def _picture(results: Results) -> Figure:
     panels = list(_panels(results))
     figure = new_figure((11, 1.2 + 2.6 * (len(panels) + 1)))
     every, colors = np.atleast_1d(figure.subplots(len(panels) + 1, 1)), _colors(results)
@@ -108,7 +124,7 @@ def _ticks(axes: Axes, results: Results) -> None:
         axes.axvline(edge, color=PALE, linewidth=0.4)
 
 
-def _value(sweep: str, value: float) -> str:
+def _value(sweep: str, value: Number) -> str:
     return f"{value:g}" if sweep == MATCHES else f"{100 * value:g} %"
 
 
@@ -118,6 +134,7 @@ def _drawn(numbers: np.ndarray, measure: Measure) -> np.ndarray:
 
 
 def _page(results: Results) -> str:
+    """Draw with plotly and return the page, which needs nothing from anywhere."""
     go, make_subplots = _plotly()
     panels, shown, colors = list(_panels(results)), set(), _colors(results)
     count = len(panels) + 1
@@ -167,7 +184,7 @@ def _plotly() -> tuple[Any, Any]:
 
 
 def _colors(results: Results) -> dict[str, str]:
-    """A colour for each method: ours cool, others warm, the limit pale."""
+    """Give each method a colour: ours are cool, others warm, the limit is pale."""
     ours, others = iter(OUR_COLORS * 9), iter(OTHER_COLORS * 9)
     known = {m.name for m in results.study.methods if not m.others}
     return {

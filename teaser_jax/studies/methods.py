@@ -1,4 +1,4 @@
-"""The methods of the studies: each takes problems of one size and answers with rows of numbers."""
+"""Who takes part in the studies: each takes problems of one size and answers with rows of numbers."""
 
 from __future__ import annotations
 
@@ -15,21 +15,19 @@ from jax.sharding import Mesh
 from teaser_jax import metrics
 from teaser_jax.certify.proof import CertifyMethod
 from teaser_jax.certify.rotation import certify_rotation
+from teaser_jax.pose import Pose
 from teaser_jax.profile import profile
 from teaser_jax.register import register
+from teaser_jax.settings import Settings
+from teaser_jax.solution import Solution, Status
 from teaser_jax.solve_batch import solve_batch
+from teaser_jax.solve_rotation import RotationSolution, solve_rotation
 from teaser_jax.stages.refinement import fit_similarity
 from teaser_jax.stages.scale import estimate_scale
 from teaser_jax.stages.translation import estimate_translation
+from teaser_jax.stages.vote.sweep import Criterion
 from teaser_jax.studies.peers import Peer
 from teaser_jax.studies.trials import Trial
-
-CliqueMethod = RotationMethod = str
-from teaser_jax.pose import Pose
-from teaser_jax.settings import Settings
-from teaser_jax.solution import Solution, Status
-from teaser_jax.solve_rotation import RotationSolution, solve_rotation
-from teaser_jax.stages.vote.sweep import Criterion
 
 Row: TypeAlias = dict[str, Any]
 OURS = "teaser_jax"
@@ -44,16 +42,16 @@ STAGES = {
 
 @dataclass(frozen=True)
 class Method:
-    """One curve of a figure.
+    """A ``Method`` is one curve of a figure: somebody who is asked about the trials.
 
     Attributes:
-        name: In table and legend.
-        run: Answers trials of one size, a row of measures each.
-        together: It takes all trials of a cell at once, and every process must call it; otherwise they
-            come one by one, so that each is saved as soon as it is there.
+        name: What table and legend call it.
+        run: Answers trials of one size on a device mesh, a row of measures each.
+        together: Whether it takes all trials of a cell at once, and every process must call it; otherwise
+            they come one by one, so that each is saved as soon as it is there.
         suits: Whether it can be asked; cells whose first trial does not suit are left out.
-        slow: Takes seconds a problem and more: not part of a quick study.
-        others: Not ours: what it raises is noted in the row and does not end the study.
+        slow: Whether it takes seconds a problem and more: then it is not part of a quick study.
+        others: Whether it is not ours: what it raises is noted in the row and does not end the study.
     """
 
     name: str
@@ -65,13 +63,24 @@ class Method:
 
 
 def in_batches(name: str = OURS, **chosen: Any) -> Method:
-    """``solve_batch`` on all trials of a cell, with some settings; the time is a share of the batch's."""
+    """Make a method that solves all trials of a cell by ``solve_batch``; the time is a share of the batch's.
+
+    Args:
+        name: What table and legend call it.
+        chosen: Fields of ``Settings``.
+    """
     settings = Settings(**chosen)
     return Method(name, partial(_in_batches, settings=settings), together=True)
 
 
 def one_by_one(name: str, *, suits: Callable[[Trial], bool] | None = None, **chosen: Any) -> Method:
-    """``register`` on each trial, warm."""
+    """Make a method that solves each trial by ``register``, warm.
+
+    Args:
+        name: What table and legend call it.
+        suits: Whether it can be asked; None: always.
+        chosen: Fields of ``Settings``.
+    """
     settings = Settings(**chosen)
 
     def solve(trial: Trial) -> Solution:
@@ -80,7 +89,7 @@ def one_by_one(name: str, *, suits: Callable[[Trial], bool] | None = None, **cho
             p.src, p.dst, noise_bound=p.noise_bound, scale=trial.scale, settings=settings
         ).solution
 
-    slow = settings.rotation == "sdp"
+    slow = settings.rotation.needs_host
     run = _each(solve, _judged, compiles=not slow)
     return Method(name, run, suits=suits or (lambda trial: True), slow=slow)
 
@@ -91,52 +100,54 @@ def few_right(trial: Trial) -> bool:
 
 
 def stage_by_stage() -> Method:
-    """``profile``: the answer of ``register`` and the seconds of every stage."""
+    """Make a method that solves by ``profile``: the answer of ``register`` and the seconds of every stage."""
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
-        for trial in trials:
-            p = trial.problem
-            found = profile(p.src, p.dst, repeats=1, noise_bound=p.noise_bound, scale=trial.scale)
-            row = _judged(trial, found.result.solution) | {"seconds": sum(found.warm.values())}
-            for stage, seconds in found.warm.items():
-                column = STAGES.get(stage, "stage_rest")
-                row[column] = row.get(column, 0.0) + seconds
-            rows.append(row)
-        return rows
+    def answer(trial: Trial) -> Row:
+        p = trial.problem
+        found = profile(p.src, p.dst, repeats=1, noise_bound=p.noise_bound, scale=trial.scale)
+        row = _judged(trial, found.result.solution) | {"seconds": sum(found.warm.values())}
+        for stage, seconds in found.warm.items():
+            column = STAGES.get(stage, "stage_rest")
+            row[column] = row.get(column, 0.0) + seconds
+        return row
 
-    return Method(f"{OURS}, stage by stage", run)
+    return Method(f"{OURS}, stage by stage", lambda trials, mesh: [answer(trial) for trial in trials])
 
 
 def limit() -> Method:
-    """The fit to the true inliers, which no method can beat but by luck."""
+    """Make the method that knows the truth: the fit to the true inliers, which can be beaten by luck only."""
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
+    def answer(trial: Trial) -> Row:
+        p = trial.problem
         with jax.enable_x64(True):
-            for trial in trials:
-                p = trial.problem
-                pose = jax.device_get(_fit(p.src, p.dst, p.inliers.astype(float), trial.scale).pose)
-                rows.append(errors(trial, pose))
-        return rows
+            fit = _fit(p.src, p.dst, p.inliers.astype(float), trial.scale)
+        return errors(trial, jax.device_get(fit.pose))
 
-    return Method(LIMIT, run)
+    return Method(LIMIT, lambda trials, mesh: [answer(trial) for trial in trials])
 
 
 def of_peer(name: str, peer: Peer) -> Method:
-    """Another library; asked only what it can answer."""
+    """Make a method of another library, asked only what it can answer.
 
-    def solve(trial: Trial) -> Pose:
+    The seconds are those of its own call, warm.
+    """
+    slow, once = name.endswith("RANSAC-60s"), _Once()
+
+    def answer(trial: Trial) -> Row:
         p = trial.problem
-        return peer.solve(p.src, p.dst, p.noise_bound, trial.scale)
+        question = peer.ask(p.src, p.dst, p.noise_bound, trial.scale)
+        if not slow:
+            once(len(p.src), question.solve)
+        found, seconds = _timed(question.solve)
+        return errors(trial, question.pose(found)) | {"seconds": seconds}
 
     suits = lambda trial: peer.finds_scale or trial.scale is not None
-    run = _each(solve, errors, compiles=False)
-    return Method(name, run, suits=suits, slow=name.endswith("RANSAC-60s"), others=True)
+    run = lambda trials, mesh: [answer(trial) for trial in trials]
+    return Method(name, run, suits=suits, slow=slow, others=True)
 
 
 def scale_by_vote(criterion: Criterion) -> Method:
-    """The scale of all pairs of matches, by the adaptive vote (section VI-A)."""
+    """Make a method that finds the scale alone, by the vote of all pairs of matches (sections VI-A, VII)."""
 
     def solve(trial: Trial) -> float:
         p = trial.for_solver()
@@ -148,7 +159,7 @@ def scale_by_vote(criterion: Criterion) -> Method:
 
 
 def translation_by_vote(criterion: Criterion) -> Method:
-    """The translation, axis by axis (section VI-C), where the rotation is the identity."""
+    """Make a method that finds the translation alone, axis by axis, of what is not turned (VI-C, VII)."""
 
     def solve(trial: Trial) -> np.ndarray:
         p = trial.for_solver()
@@ -162,20 +173,23 @@ def translation_by_vote(criterion: Criterion) -> Method:
     return Method(VOTES[criterion], _each(solve, judge))
 
 
-def clique_alone(name: str, clique: CliqueMethod) -> Method:
-    """What the clique leaves of the wrong matches; the time is that of the whole solve."""
+def clique_alone(name: str, clique: str) -> Method:
+    """Make a method that says what the clique leaves of the wrong matches (section VI-D).
+
+    The time is that of the whole solve.
+    """
     run = partial(_in_batches, settings=Settings(clique=clique), measure=_pruned)
     return Method(name, run, together=True)
 
 
 def before_pruning() -> Method:
-    """The share of wrong matches that the clique starts from."""
+    """Make a method that says with what share of wrong matches the clique starts."""
     run = lambda trials, mesh: [{"outliers_left": 1 - float(t.problem.inliers.mean())} for t in trials]
     return Method("before pruning", run)
 
 
-def rotation_alone(name: str, method: RotationMethod) -> Method:
-    """Rotation search on vectors, without a proof (section VII)."""
+def rotation_alone(name: str, method: str) -> Method:
+    """Make a method that finds the rotation between vectors alone, without a proof (sections VIII, X)."""
 
     def solve(trial: Trial) -> RotationSolution:
         p = trial.problem
@@ -187,40 +201,36 @@ def rotation_alone(name: str, method: RotationMethod) -> Method:
 
 
 def rotation_certified(name: str, proof: CertifyMethod) -> Method:
-    """GNC's rotation and its certificate (section VIII): proved within 0.1 % and 200 iterations, or not.
+    """Make a method that certifies GNC's rotation (section VIII-C), within 0.1 % and 200 iterations, or not.
 
     The time is that of the certificate.
     """
     once = _Once()
 
-    def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
-        rows = []
-        for trial in trials:
-            p = trial.problem
-            found = solve_rotation(p.src, p.dst, noise_bound=p.noise_bound, method="gnc", proof=None)
-            certify = partial(
-                certify_rotation, p.src, p.dst, found.rotation,
-                noise_bound=p.noise_bound, iterations=200, method=proof,
-            )  # fmt: skip
-            once(len(p.src), certify)
-            start = time.perf_counter()
-            certificate = certify()
-            seconds = time.perf_counter() - start
-            rows.append({
-                **errors(trial, _turn(found.rotation)),
-                "proved": int(certificate.is_optimal),
-                "suboptimality": float(certificate.suboptimality),
-                "iterations": int(certificate.iterations),
-                "cost": float(found.cost),
-                "seconds": seconds,
-            })  # fmt: skip
-        return rows
+    def answer(trial: Trial) -> Row:
+        p = trial.problem
+        found = solve_rotation(p.src, p.dst, noise_bound=p.noise_bound, method="gnc", proof=None)
+        certify = partial(
+            certify_rotation, p.src, p.dst, found.rotation,
+            noise_bound=p.noise_bound, iterations=200, method=proof,
+        )  # fmt: skip
+        once(len(p.src), certify)
+        certificate, seconds = _timed(certify)
+        return {
+            **errors(trial, _turn(found.rotation)),
+            "proved": int(certificate.is_optimal),
+            "suboptimality": float(certificate.suboptimality),
+            "iterations": int(certificate.iterations),
+            "cost": float(found.cost),
+            "seconds": seconds,
+        }
 
+    run = lambda trials, mesh: [answer(trial) for trial in trials]
     return Method(name, run, slow=proof == "reference")
 
 
 def errors(trial: Trial, pose: Pose) -> Row:
-    """Of a pose, against the truth; a known scale has none."""
+    """Measure a pose against the truth of its trial; a known scale has no error."""
     error = metrics.errors(pose, trial.problem.truth)
     row = {"rotation_deg": float(error.rotation_deg), "translation": float(error.translation)}
     return row if trial.scale is not None else row | {"scale_error": float(error.scale)}
@@ -235,9 +245,8 @@ def _in_batches(
 ) -> list[Row]:
     problems = [trial.for_solver() for trial in trials]
     solve_batch(problems[:1], settings, mesh=mesh)  # compiles
-    start = time.perf_counter()
-    found: Any = solve_batch(problems, settings, mesh=mesh)
-    timing = {"seconds": (time.perf_counter() - start) / len(trials), "together": len(trials)}
+    found, seconds = _timed(partial(solve_batch, problems, settings, mesh=mesh))
+    timing = {"seconds": seconds / len(trials), "together": len(trials)}
     return [(measure or _judged)(t, s) | timing for t, s in zip(trials, found, strict=True)]
 
 
@@ -264,7 +273,7 @@ def _each(
     *,
     compiles: bool = True,
 ) -> Callable[[list[Trial], Mesh | None], list[Row]]:
-    """Trials one by one: the seconds of ``solve``, warm, and what ``judge`` makes of its answer."""
+    """Ask about trials one by one: the seconds of ``solve``, warm, and what ``judge`` says of its answer."""
     once = _Once()
 
     def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
@@ -272,17 +281,22 @@ def _each(
         for trial in trials:
             if compiles:
                 once(len(trial.problem.src), partial(solve, trial))
-            start = time.perf_counter()
-            found = solve(trial)
-            seconds = time.perf_counter() - start
+            found, seconds = _timed(partial(solve, trial))
             rows.append(judge(trial, found) | {"seconds": seconds})
         return rows
 
     return run
 
 
+def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
+    """What a call returns, and its seconds."""
+    start = time.perf_counter()
+    found = call()
+    return found, time.perf_counter() - start
+
+
 class _Once:
-    """Runs something the first time a size comes, so that what is timed does not compile."""
+    """It runs something the first time a size comes, so that no compilation is timed, nor a start of threads."""
 
     def __init__(self) -> None:
         self.seen: set[int] = set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from importlib import metadata
 from itertools import groupby
@@ -14,14 +14,15 @@ from typing import Any, NamedTuple
 
 import jax
 from jax.sharding import Mesh
-from tqdm import tqdm
 
 from teaser_jax.engine.processes import all_of, check_agreement
-from teaser_jax.files import FileError, one_line, whole
-from teaser_jax.studies.catalogue import Study, studies
+from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.io import FileError, one_line, os_errors_named, replacing
+from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.figures import check_drawing, draw_study
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.results import ABOUT, TABLE
+from teaser_jax.studies.study import Study
 from teaser_jax.studies.table import Table, written
 from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, check_seed
 
@@ -30,9 +31,9 @@ PROTOCOL = 1  # raised when a study draws other problems for the same seed
 
 
 class Todo(NamedTuple):
-    """Runs that a table lacks, of one cell and method."""
+    """A ``Todo`` lists the runs of one cell and method that a table lacks."""
 
-    value: float
+    value: Number
     method: Method
     numbers: list[int]
 
@@ -59,7 +60,7 @@ def run_study(
         name: One of ``studies()``.
         folder: Where ``NAME/table.csv``, ``about.json``, ``figure.png`` and ``figure.html`` go.
         runs: Problems a cell; None: the study's own, 40 or more.
-        seed: Of the whole study.
+        seed: The seed of the whole study.
         model: What points are drawn from, see ``read_model``.
         methods: Names of those that take part; None: all, in a quick study without the slow ones.
         mesh: Devices for the methods that take problems in batches; None: all. Under ``jax.distributed``
@@ -76,50 +77,82 @@ def run_study(
         ImportError: Without the extra ``studies``, before anything is computed.
     """
     check_drawing()
-    study = named_study(name)
-    chosen = _chosen(study, methods, quick)
-    cells = study.cells(runs, quick=quick)
-    seed = check_seed(seed)
-    for value, _ in cells:
-        study.trial(seed, value, 0, model)  # says now, before anything is written, if there is none
+    study, seed = named_study(name), check_seed(seed)
+    work = _Work(study, seed, model, study.cells(runs, quick=quick), _chosen(study, methods, quick), mesh)
+    work.check()
     asked = (name, runs, seed, model.name, model.shape, methods, quick)
     check_agreement("run_study", asked, error=StudyError)
     place = Path(folder) / name
-    with ExitStack() as stack:
-        table, known, failure = None, set(), None
-        if jax.process_index() == 0:
-            try:
-                table = stack.enter_context(_opened(place, study, seed, model))
-                known = {_key(row, study) for row in table.rows}
-            except FileError as error:
-                failure = str(error)
-        known, failure = all_of((known, failure))[0]
-        if failure is not None:
-            raise FileError(failure)  # in every process, or the others would wait
-        todo = list(_todo(cells, chosen, known, lambda value: study.trial(seed, value, 0, model)))
-        bar = stack.enter_context(
-            tqdm(total=sum(len(t.numbers) for t in todo), disable=not progress, unit="row", desc=name)
-        )
-        for rows in _rows(study, todo, seed, model, mesh):
-            if table is not None:
-                table.append(rows)
-            bar.update(len(rows))
+    _fill(place, work, progress)
     if jax.process_index() == 0:
         draw_study(place)
     return place
 
 
-def _rows(study: Study, todo: list[Todo], seed: int, model: Model, mesh: Mesh | None) -> Iterator[list[Row]]:
-    """The rows of the table as they come, cell by cell."""
-    for value, cell in groupby(todo, key=lambda t: t.value):
-        listed = list(cell)
-        numbers = sorted({k for each in listed for k in each.numbers})
-        trials = {k: study.trial(seed, value, k, model) for k in numbers}
-        for _, method, some in listed:
-            yield from _answers(study, method, [trials[k] for k in some], mesh)
+class _Work(NamedTuple):
+    """What was asked of a study, and those that do it."""
+
+    study: Study
+    seed: int
+    model: Model
+    cells: list[tuple[Number, range]]
+    methods: list[Method]
+    mesh: Mesh | None
+
+    def trial(self, value: Number, number: int = 0) -> Trial:
+        return self.study.trial(self.seed, value, number, self.model)
+
+    def check(self) -> None:
+        """Raise StudyError now, before anything is written, if a cell cannot be drawn."""
+        for value, _ in self.cells:
+            self.trial(value)
+
+    def todo(self, known: set[tuple[Any, ...]]) -> Iterator[Todo]:
+        """List what is missing, of the methods that the first trial of a cell suits."""
+        for value, numbers in self.cells:
+            first = self.trial(value)
+            for method in self.methods:
+                missing = [k for k in numbers if (written(value), k, method.name) not in known]
+                if missing and method.suits(first):
+                    yield Todo(value, method, missing)
+
+    def rows(self, todo: Sequence[Todo]) -> Iterator[list[Row]]:
+        """Compute rows of the table as they come, cell by cell."""
+        for value, cell in groupby(todo, key=lambda t: t.value):
+            listed = list(cell)
+            numbers = sorted({k for each in listed for k in each.numbers})
+            trials = {k: self.trial(value, k) for k in numbers}
+            for _, method, some in listed:
+                yield from _answers(self.study, method, [trials[k] for k in some], self.mesh)
+
+
+def _fill(place: Path, work: _Work, progress: bool) -> None:
+    """Compute the rows that the table lacks; in every process, of which the first one writes."""
+    from tqdm import tqdm
+
+    with ExitStack() as stack:
+        table, known, failure = None, set(), None
+        if jax.process_index() == 0:
+            try:
+                table = stack.enter_context(_opened(place, work))
+                known = {_key(row, work.study) for row in table.rows}
+            except FileError as error:
+                failure = str(error)
+        known, failure = all_of((known, failure))[0]
+        if failure is not None:
+            raise FileError(failure)  # in every process, or the others would wait
+        todo = list(work.todo(known))
+        count = sum(len(each.numbers) for each in todo)
+        bar = stack.enter_context(tqdm(total=count, disable=not progress, unit="row", desc=work.study.name))
+        for rows in work.rows(todo):
+            if table is not None:
+                table.append(rows)
+            bar.update(len(rows))
 
 
 def _answers(study: Study, method: Method, trials: list[Trial], mesh: Mesh | None) -> Iterator[list[Row]]:
+    """Ask a method about trials of one cell, together or one by one, shared among the processes."""
+
     def named(some: list[Trial], measured: list[Row]) -> list[Row]:
         return [
             {study.sweep: t.value, "trial": t.number, "method": method.name} | row
@@ -138,7 +171,7 @@ def _answers(study: Study, method: Method, trials: list[Trial], mesh: Mesh | Non
 
 
 def _guarded(method: Method, trial: Trial) -> list[Row]:
-    """A row of measures; for another library that raises, a row that says so."""
+    """Ask a method about one trial; if it is another library and raises, the row says so."""
     try:
         return method.run([trial], None)
     except Exception as error:
@@ -147,57 +180,49 @@ def _guarded(method: Method, trial: Trial) -> list[Row]:
         return [{"error": f"{type(error).__name__}: {one_line(error)}"}]
 
 
-def _todo(
-    cells: list[tuple[float, range]],
-    chosen: list[Method],
-    known: set[tuple[Any, ...]],
-    first: Callable[[float], Trial],
-) -> Iterator[Todo]:
-    """What is missing, of the methods that the first trial of a cell suits."""
-    for value, numbers in cells:
-        trial = first(value)
-        for method in chosen:
-            missing = [k for k in numbers if (written(value), k, method.name) not in known]
-            if missing and method.suits(trial):
-                yield Todo(value, method, missing)
-
-
 def _key(row: Row, study: Study) -> tuple[Any, ...]:
+    """Tell which cell, run and method a row is of."""
     return written(row[study.sweep]), int(row["trial"]), row["method"]
 
 
-def _opened(place: Path, study: Study, seed: int, model: Model) -> Table:
-    """The table of a study in its folder, which must be of the same problems."""
+def _opened(place: Path, work: _Work) -> Table:
+    """Open the table of a study in its folder, which must be of the same problems, and say who goes on."""
+    study = work.study
     about = {
         "study": study.name, "figure": study.figure, "title": study.title, "sweep": study.sweep,
-        "model": model.name, "seed": seed, "protocol": PROTOCOL,
+        "model": work.model.name, "seed": work.seed, "protocol": PROTOCOL,
     }  # fmt: skip
     path = place / ABOUT
-    try:
+    with os_errors_named(place, "cannot be written"):
         place.mkdir(parents=True, exist_ok=True)
-        before: dict[str, Any] = about | {"made_with": []}
-        if path.exists():
-            before = json.loads(path.read_text(encoding="utf-8"))
-        for key in ("study", "model", "seed", "protocol"):
-            if before.get(key) != about[key]:
-                raise FileError(
-                    f"{place}: holds a study of {key} {before.get(key)!r}, and {about[key]!r} is asked for: "
-                    "name another folder."
-                )
-        here = environment()
-        made_with = [*before["made_with"], *([] if here in before["made_with"] else [here])]
+        try:
+            made_with = _made_with(place, about)
+        except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+            raise FileError(f"{path}: is no description of a study ({error}): remove the folder.") from error
         table = Table(place / TABLE, (study.sweep, "trial", "method", *study.columns, "error"))
-        with whole(path) as partial:
+        with replacing(path) as partial:
             partial.write_text(json.dumps(about | {"made_with": made_with}, indent=1) + "\n")
         return table
-    except OSError as error:
-        raise FileError(f"{place}: cannot be written: {error.strerror or error}.") from error
-    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise FileError(f"{path}: is no description of a study ({error}): remove the folder.") from error
+
+
+def _made_with(place: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
+    """List the environments that have worked on a study, and this one; FileError if it is another study."""
+    path, here = place / ABOUT, environment()
+    if not path.exists():
+        return [here]
+    before = json.loads(path.read_text(encoding="utf-8"))
+    for key in ("study", "model", "seed", "protocol"):
+        if before.get(key) != about[key]:
+            raise FileError(
+                f"{place}: holds a study of {key} {before.get(key)!r}, and {about[key]!r} is asked for: "
+                "name another folder."
+            )
+    made_with: list[dict[str, Any]] = before["made_with"]
+    return [*made_with, *([] if here in made_with else [here])]
 
 
 def environment() -> dict[str, Any]:
-    """Machine and versions, as a report states them."""
+    """Tell which machine and which versions of packages this is, as a report states them."""
     versions = {}
     for package in PACKAGES:
         try:
@@ -215,7 +240,7 @@ def environment() -> dict[str, Any]:
 
 
 def processor() -> str:
-    """The name of the processor, as the system knows it."""
+    """Tell the name of the processor, as the system knows it."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -223,7 +248,7 @@ def processor() -> str:
 
 
 def named_study(name: str) -> Study:
-    """One of ``studies()``; StudyError with their names if there is none."""
+    """Return one of ``studies()``, or raise StudyError with their names."""
     known = studies()
     if name not in known:
         raise StudyError(f"there is no study {name!r}: expected one of {', '.join(known)}.")
@@ -231,6 +256,7 @@ def named_study(name: str) -> Study:
 
 
 def _chosen(study: Study, names: Sequence[str] | None, quick: bool) -> list[Method]:
+    """Choose those that take part by their names, or raise StudyError."""
     if names is None:
         return [each for each in study.methods if not (quick and each.slow)]
     known = {each.name: each for each in study.methods}

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from teaser_jax.files import FileError, read_archive, whole
+from teaser_jax.ground.io import FileError, os_errors_named, read_archive, replacing
 from teaser_jax.pose import Pose
-from teaser_jax.studies.catalogue import Study
+from teaser_jax.studies.study import Study
 from teaser_jax.studies.trials import TEAPOT, Model, Trial, check_seed
 from teaser_jax.synthetic import SyntheticProblem
 
@@ -25,7 +25,14 @@ SHAPES = {
 def draw_trials(
     study: Study, *, runs: int | None = None, seed: int = 0, model: Model = TEAPOT, quick: bool = False
 ) -> Iterator[Trial]:
-    """The problems of a study, cell by cell: those that ``run_study`` asks every method.
+    """Draw the problems of a study, cell by cell: those that ``run_study`` asks every method.
+
+    Args:
+        study: One of ``studies()``.
+        runs: Problems a cell; None: the study's own.
+        seed: The seed of the whole study.
+        model: What points are drawn from, see ``read_model``.
+        quick: A few cells of three runs each.
 
     Raises:
         StudyError: On runs or a seed that make no sense.
@@ -60,23 +67,21 @@ def save_trials(
     """
     folder = Path(folder)
     written: list[Path] = []
-    try:
+    with os_errors_named(folder, "cannot be written"):
         folder.mkdir(parents=True, exist_ok=True)
         for shard in _shards(trials, shard_bytes):
             path = folder / f"{name}-{len(written):05d}.npz"
-            with whole(path) as partial:
+            with replacing(path) as partial:
                 arrays: dict[str, Any] = _arrays(shard)
                 np.savez_compressed(partial, **arrays)
             written.append(path)
         for older in set(folder.glob(f"{name}-[0-9][0-9][0-9][0-9][0-9].npz")) - set(written):
             older.unlink()
-    except OSError as error:
-        raise FileError(f"{folder}: cannot be written: {error.strerror or error}.") from error
     return written
 
 
 def read_trials(paths: str | Path | Sequence[str | Path]) -> Iterator[Trial]:
-    """The problems of ``save_trials`` again, bit for bit, one by one.
+    """Read the problems of ``save_trials`` again, bit for bit, one by one.
 
     Args:
         paths: A folder, whose shards are read in order of their names; or a shard, or several.
@@ -94,6 +99,7 @@ def read_trials(paths: str | Path | Sequence[str | Path]) -> Iterator[Trial]:
 
 
 def _shards(trials: Iterable[Trial], shard_bytes: int) -> Iterator[list[Trial]]:
+    """Group neighbours of one size, as many as fit into a file."""
     for size, some in groupby(trials, key=lambda t: len(t.problem.src)):
         most, shard = max(1, shard_bytes // (49 * size + 200)), []
         for trial in some:
@@ -123,12 +129,10 @@ def _arrays(trials: list[Trial]) -> dict[str, np.ndarray]:
 
 
 def _read(path: Path) -> Iterator[Trial]:
-    try:
+    if not path.exists():
+        raise FileError(f"{path}: no such file.")
+    with os_errors_named(path, "cannot be read"):
         arrays = read_archive(path)
-    except FileNotFoundError:
-        raise FileError(f"{path}: no such file.") from None
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror or error}.") from error
     if missing := set(SHAPES) - set(arrays):
         raise FileError(f"{path}: is no shard of problems: it lacks {', '.join(sorted(missing))}.")
     count = len(arrays["value"]) if arrays["value"].ndim else 0

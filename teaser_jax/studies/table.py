@@ -16,13 +16,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from teaser_jax.files import FileError
+from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.io import FileError
 
 TEXT = ("method", "error")
 
 
 class Table:
-    """A CSV file open for more rows; a context manager that no second program can enter meanwhile.
+    """A ``Table`` is a CSV file open for more rows, which no second program can open meanwhile.
+
+    As a context manager it closes the file at the end.
+
+    Attributes:
+        rows: The rows that it held when it was opened.
 
     Raises:
         FileError: If the file holds other columns, or another program writes it.
@@ -48,7 +54,14 @@ class Table:
         self._file.close()
 
     def append(self, rows: Iterable[dict[str, Any]]) -> None:
-        """Write rows and wait until the disk has them."""
+        """Write rows and wait until the disk has them.
+
+        Args:
+            rows: Values by column; absent ones and None are left empty.
+
+        Raises:
+            FileError: If they cannot be written; the rows before are safe.
+        """
         self._write([[_text(row.get(column)) for column in self.columns] for row in rows])
 
     def _mend(self) -> None:
@@ -80,9 +93,12 @@ class Table:
 
 
 def read_table(path: str | Path) -> list[dict[str, Any]]:
-    """The rows of a study's table: numbers as float, absent ones left out.
+    """Read the rows of a study's table: numbers as float, absent ones left out.
 
     A broken last line, as a running or killed study may leave it, is no row.
+
+    Args:
+        path: ``table.csv`` in the folder of a study.
 
     Raises:
         FileError: If there is no such file, or a row does not fit its header or says not which run it is.
@@ -96,26 +112,29 @@ def read_table(path: str | Path) -> list[dict[str, Any]]:
         raise FileError(f"{path}: cannot be read as a table ({error}).") from error
     lines = csv.reader(text[: text.rfind("\n") + 1].splitlines())
     header = next(lines, [])
-    rows = []
-    for number, line in enumerate(lines, 2):
-        if len(line) != len(header):
-            raise FileError(
-                f"{path}: line {number} has {len(line)} fields, the header {len(header)}: mend or remove it."
-            )
-        try:
-            row = {c: x if c in TEXT else float(x) for c, x in zip(header, line, strict=True) if x != ""}
-        except ValueError as error:
-            raise FileError(f"{path}: line {number}: {error}: mend or remove it.") from None
-        value, trial = (float(row.get(column, math.nan)) for column in (*header[:1], "trial"))
-        if "method" not in row or not (math.isfinite(value) and trial >= 0 and trial % 1 == 0):
-            raise FileError(
-                f"{path}: line {number} does not say which cell, trial and method it is of: mend it."
-            )
-        rows.append(row)
-    return rows
+    return [_row(path, number, header, line) for number, line in enumerate(lines, 2)]
+
+
+def _row(path: Path, number: int, header: list[str], line: list[str]) -> dict[str, Any]:
+    """Read one line of a table, or raise FileError with its number."""
+    if len(line) != len(header):
+        raise FileError(
+            f"{path}: line {number} has {len(line)} fields, the header {len(header)}: mend or remove it."
+        )
+    try:
+        row: dict[str, Any] = {
+            c: x if c in TEXT else float(x) for c, x in zip(header, line, strict=True) if x != ""
+        }
+    except ValueError as error:
+        raise FileError(f"{path}: line {number}: {error}: mend or remove it.") from None
+    value, trial = (float(row.get(column, math.nan)) for column in (*header[:1], "trial"))
+    if "method" not in row or not (math.isfinite(value) and trial >= 0 and trial % 1 == 0):
+        raise FileError(f"{path}: line {number} does not say which cell, trial and method it is of: mend it.")
+    return row
 
 
 def _text(value: Any) -> str:
+    """Make the field of a table from a number, a text or nothing."""
     if value is None:
         return ""
     if isinstance(value, str):
@@ -123,13 +142,13 @@ def _text(value: Any) -> str:
     return written(float(value))
 
 
-def written(number: float) -> str:
-    """A number as tables hold it, so that what is read can be compared with what was meant."""
+def written(number: Number) -> str:
+    """Write a number as tables hold it, so that what is read can be compared with what was meant."""
     return f"{number:.7g}"
 
 
 def _lock(file: FileIO, path: Path) -> None:
-    """One writer at a time, where the system can say so; the lock ends with the program, however it ends."""
+    """Let one writer in at a time, where the system can; the lock ends with the program, however it ends."""
     try:
         import fcntl
     except ImportError:  # Windows

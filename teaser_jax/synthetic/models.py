@@ -1,7 +1,6 @@
-"""Models to sample points from.
+"""Models to sample points from: points, triangles, or a teapot that needs no file.
 
-No data files: the default is a small teapot, a solid of blended primitives without any symmetry, so
-that its pose is unique.
+The teapot is a solid of blended primitives without any symmetry, so that its pose is unique.
 """
 
 from __future__ import annotations
@@ -11,27 +10,47 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Real
 
 Points: TypeAlias = Float[np.ndarray, "n 3"]
-Seed: TypeAlias = int | Sequence[int]
+Seed: TypeAlias = int | np.integer | Sequence[int] | np.random.SeedSequence
 
 
-class Mesh(NamedTuple):
-    """A triangle mesh to sample from: a model with any number of surface points."""
+class Triangles(NamedTuple):
+    """``Triangles`` are a surface to sample from: a model with any number of points.
+
+    Attributes:
+        vertices: Corners of the triangles [length].
+        faces: Rows of the three vertices of each triangle.
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
 
 
-def sample_model(rng: np.random.Generator, n: int, model: Points | Mesh | None = None) -> Points:
-    """``n`` different points of a model, resized together to fit [0, 1]^3."""
-    if isinstance(model, Mesh):
+Shape: TypeAlias = Real[np.ndarray, "m 3"] | Triangles | None  # what points are drawn from; None: the teapot
+
+
+def sample_model(rng: np.random.Generator, n: int, model: Shape = None) -> Points:
+    """Draw different points of a model, and resize them together to fit [0, 1]^3.
+
+    Args:
+        rng: Where randomness comes from.
+        n: Number of points.
+        model: (m, 3) points, drawn without replacement, or triangles, drawn from by area; None: the teapot.
+
+    Returns:
+        (n, 3) points, the longest side of their bounding box being 1.
+
+    Raises:
+        ValueError: If the model has fewer points than ``n``, or triangles without any area.
+    """
+    if isinstance(model, Triangles):
         points = _on_triangles(rng, n, model)
     else:
         pool = teapot(max(n, 20_000)) if model is None else np.asarray(model, float)
         if n > len(pool):
-            raise ValueError(f"the model has {len(pool)} points, fewer than n = {n}: give a Mesh instead.")
+            raise ValueError(f"the model has {len(pool)} points, fewer than n = {n}: give Triangles instead.")
         points = pool[rng.choice(len(pool), n, replace=False)]
     low = points.min(axis=0)
     extent = (points.max(axis=0) - low).max()
@@ -40,7 +59,10 @@ def sample_model(rng: np.random.Generator, n: int, model: Points | Mesh | None =
 
 @functools.lru_cache(maxsize=2)
 def teapot(n: int) -> Points:
-    """``n`` points, uniform on the surface of the teapot; always the same ones, read-only."""
+    """Return ``n`` points, uniform on the surface of the teapot; always the same ones, read-only.
+
+    The teapot stands about the origin, z up, and is some two units long.
+    """
     rng, found = np.random.default_rng(0), np.zeros((0, 3))
     while len(found) < n:
         x = rng.uniform((-1, -0.7, -0.6), (1.1, 0.8, 0.8), (50_000, 3))
@@ -59,7 +81,7 @@ def teapot(n: int) -> Points:
 
 
 def _teapot_distance(x: Points) -> Float[np.ndarray, " n"]:
-    """Negative inside, zero on the surface: a blend of simple solids, z up, spout along x."""
+    """Measure how far points are outside the teapot, a blend of simple solids; negative inside."""
 
     def ball(centre: Sequence[float], radii: Any) -> np.ndarray:
         return (np.linalg.norm((x - centre) / radii, axis=1) - 1) * np.min(radii)
@@ -83,8 +105,8 @@ def _teapot_slope(x: Points, step: float = 1e-5) -> Points:
     return np.stack(central, axis=1) / (2 * step)
 
 
-def _on_triangles(rng: np.random.Generator, n: int, mesh: Mesh) -> Points:
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices, float)[np.asarray(mesh.faces)], 1, 0)
+def _on_triangles(rng: np.random.Generator, n: int, model: Triangles) -> Points:
+    a, b, c = np.moveaxis(np.asarray(model.vertices, float)[np.asarray(model.faces)], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if not area.sum() > 0:
         raise ValueError("the triangles of the model have no area.")

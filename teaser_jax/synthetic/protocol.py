@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax import so3
+from teaser_jax.ground.arrays import Number
 from teaser_jax.pose import Pose
-from teaser_jax.synthetic.models import Mesh, Points, Seed, sample_model
+from teaser_jax.synthetic.models import Points, Seed, Shape, sample_model
 
 SIGMA = 0.01
 BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimensions
@@ -21,13 +22,13 @@ BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimen
 
 @dataclass(frozen=True, eq=False)
 class SyntheticProblem:
-    """Matched points and the truth about them.
+    """A ``SyntheticProblem`` holds matched points and the truth about them.
 
     Attributes:
-        src, dst: Matched points, row i with row i; the model fits [0, 1]^3.
+        src, dst: Matched points, row i with row i; the model fits [0, 1]^3 [length].
         truth: The pose behind the right matches, ``T_dst_src``.
         inliers: The right matches; every other one misses the truth by more than the bound.
-        noise_bound: beta, the largest error of a right match.
+        noise_bound: beta, the largest error of a right match [length].
     """
 
     src: Points
@@ -41,15 +42,15 @@ def random_problem(
     seed: Seed,
     *,
     n: int = 1000,
-    outlier_rate: float = 0.95,
-    scale: float | tuple[float, float] = 1.0,
-    sigma: float = SIGMA,
-    noise_bound: float | None = None,
-    radius: float = 5.0,
-    model: Points | Mesh | None = None,
+    outlier_rate: Number = 0.95,
+    scale: Number | tuple[Number, Number] = 1.0,
+    sigma: Number = SIGMA,
+    noise_bound: Number | None = None,
+    radius: Number = 5.0,
+    model: Shape = None,
     truth: Pose | None = None,
 ) -> SyntheticProblem:
-    """A problem by the paper's protocol: wrong matches are uniform in a ball.
+    """Draw a problem by the paper's protocol: wrong matches are uniform in a ball.
 
     The target is s R a + t with R uniform on SO(3) and t uniform in the unit ball. Noise is
     Gaussian, drawn again until its norm is at most the bound. An ``outlier_rate`` of 1 leaves no
@@ -59,11 +60,11 @@ def random_problem(
         seed: Anything ``numpy.random.default_rng`` takes; the same seed gives the same problem.
         n: Number of matches.
         outlier_rate: Share of wrong matches, rounded to whole matches.
-        scale: The scale, or the range from which it is drawn; the paper's is (1, 5).
-        sigma: Standard deviation of the noise of each coordinate.
-        noise_bound: beta; None: 5.54 sigma, as in the paper.
-        radius: Radius of the ball of wrong targets. A smaller one makes more chance agreements.
-        model: (m, 3) points, drawn without replacement, or a mesh; None: the teapot. Resized to
+        scale: The scale, or the range from which it is drawn; the paper's is (1, 5) [-].
+        sigma: Standard deviation of the noise of each coordinate [length].
+        noise_bound: beta [length]; None: 5.54 sigma, as in the paper.
+        radius: Radius of the ball of wrong targets [length]. A smaller one makes more chance agreements.
+        model: (m, 3) points, drawn without replacement, or triangles; None: the teapot. Resized to
             fit [0, 1]^3.
         truth: A pose to use instead of a random one; its scale takes the place of ``scale``.
 
@@ -81,15 +82,15 @@ def descriptor_problem(
     seed: Seed,
     *,
     n: int = 1000,
-    outlier_rate: float = 0.95,
-    hubs: float = 0.05,
-    scale: float | tuple[float, float] = 1.0,
-    sigma: float = SIGMA,
-    noise_bound: float | None = None,
-    model: Points | Mesh | None = None,
+    outlier_rate: Number = 0.95,
+    hubs: Number = 0.05,
+    scale: Number | tuple[Number, Number] = 1.0,
+    sigma: Number = SIGMA,
+    noise_bound: Number | None = None,
+    model: Shape = None,
     truth: Pose | None = None,
 ) -> SyntheticProblem:
-    """A problem as descriptor matching makes it: wrong matches lie on the target, many to one.
+    """Draw a problem as descriptor matching makes it: wrong matches lie on the target, many to one.
 
     A descriptor errs towards a few points that look like everything. Wrong matches share
     ``hubs * n`` points of the target among them, so both the density of chance agreements and
@@ -100,7 +101,7 @@ def descriptor_problem(
         hubs: Number of points that attract wrong matches, as a share of n; 1: nearly one to one.
 
     Raises:
-        ValueError: As ``random_problem``.
+        ValueError: As ``random_problem``; and if the bound spans the target, so that no match could be wrong.
     """
     rng = np.random.default_rng(seed)
     right = _right_matches(rng, n, scale, sigma, noise_bound, model, truth)
@@ -114,13 +115,15 @@ def all_to_all(
     seed: Seed,
     *,
     n: int = 100,
-    overlap: float = 1.0,
-    sigma: float = 0.01 / BOUND_PER_SIGMA,
-    noise_bound: float | None = None,
-    model: Points | Mesh | None = None,
+    overlap: Number = 1.0,
+    sigma: Number = 0.01 / BOUND_PER_SIGMA,
+    noise_bound: Number | None = None,
+    model: Shape = None,
     truth: Pose | None = None,
 ) -> SyntheticProblem:
-    """No correspondences: every source point matched with every point of a part of the target.
+    """Draw a problem without correspondences: every source point matched with every target point.
+
+    The target is a part of the moved model.
 
     Rows run over the source first: match i * m + j pairs source point i with target point j, for
     m = overlap * n target points in random order.
@@ -144,20 +147,20 @@ def all_to_all(
     return SyntheticProblem(whole.src[i], whole.dst[j], whole.truth, i == j, whole.noise_bound)
 
 
-def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Uniform on SO(3)."""
+def draw_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """Draw a rotation uniformly from SO(3)."""
     return np.asarray(so3.rotation_from_quat(rng.standard_normal(4)))
 
 
-def in_ball(rng: np.random.Generator, n: int, radius: float) -> Points:
-    """Uniform in the ball around the origin."""
+def in_ball(rng: np.random.Generator, n: int, radius: Number) -> Points:
+    """Draw points uniformly from the ball of a radius [length] around the origin."""
     directions = rng.standard_normal((n, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return radius * np.cbrt(rng.random((n, 1))) * directions
 
 
-def bounded_noise(rng: np.random.Generator, n: int, sigma: float, bound: float) -> Points:
-    """Gaussian errors, each drawn again until its norm is at most the bound."""
+def bounded_noise(rng: np.random.Generator, n: int, sigma: Number, bound: Number) -> Points:
+    """Draw Gaussian errors of three dimensions [length], each again until its norm is at most the bound."""
     noise = sigma * rng.standard_normal((n, 3))
     while (outside := np.linalg.norm(noise, axis=1) > bound).any():
         noise[outside] = sigma * rng.standard_normal((outside.sum(), 3))
@@ -167,21 +170,21 @@ def bounded_noise(rng: np.random.Generator, n: int, sigma: float, bound: float) 
 def _right_matches(
     rng: np.random.Generator,
     n: int,
-    scale: float | tuple[float, float],
-    sigma: float,
-    noise_bound: float | None,
-    model: Points | Mesh | None,
+    scale: Number | tuple[Number, Number],
+    sigma: Number,
+    noise_bound: Number | None,
+    model: Shape,
     truth: Pose | None,
 ) -> SyntheticProblem:
     if n < 1 or sigma < 0:
         raise ValueError(f"received n = {n} and sigma = {sigma}: expected n above 0, sigma 0 or above.")
-    bound = BOUND_PER_SIGMA * sigma if noise_bound is None else float(noise_bound)
+    bound = float(BOUND_PER_SIGMA * sigma if noise_bound is None else noise_bound)
     if bound < sigma:
         raise ValueError(f"noise_bound {bound} is below sigma {sigma}: most noise would be drawn again.")
     src = sample_model(rng, n, model)
     if truth is None:
         drawn = rng.uniform(*scale) if isinstance(scale, tuple) else scale
-        truth = Pose(random_rotation(rng), in_ball(rng, 1, 1.0)[0], np.asarray(drawn, float))
+        truth = Pose(draw_rotation(rng), in_ball(rng, 1, 1.0)[0], np.asarray(drawn, float))
     dst = truth.apply(src) + bounded_noise(rng, n, sigma, bound)
     return SyntheticProblem(src, dst, truth, np.ones(n, bool), bound)
 
@@ -189,7 +192,7 @@ def _right_matches(
 def _with_outliers(
     rng: np.random.Generator,
     right: SyntheticProblem,
-    rate: float,
+    rate: Number,
     draw: Callable[[Int[np.ndarray, " k"]], Points],
 ) -> SyntheticProblem:
     if not 0 <= rate <= 1:

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
+from teaser_jax.ground.arrays import Number
 from teaser_jax.pose import Pose
 from teaser_jax.synthetic.models import Points, Seed
-from teaser_jax.synthetic.protocol import random_rotation
+from teaser_jax.synthetic.protocol import draw_rotation
 
-Vector = Float[np.ndarray, "3"]
+Vector: TypeAlias = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
 class ScanPair:
-    """Two scans of one object from two sides, each in a frame of its own; rows do *not* correspond.
+    """A ``ScanPair`` holds scans of one object from two sides, each in a frame of its own.
+
+    Rows of the two do *not* correspond.
 
     Attributes:
-        src, dst: Points.
-        src_viewpoint, dst_viewpoint: Where the sensor stood, in the frame of its scan.
+        src, dst: Points of the scans [length].
+        src_viewpoint, dst_viewpoint: Where the sensor stood, in the frame of its scan [length].
         truth: ``T_dst_src``.
     """
 
@@ -36,19 +40,19 @@ def scan_pair(
     model: Points,
     *,
     n: int = 640,
-    sigma: float = 0.005,
-    turn: tuple[float, float] = (20.0, 50.0),
-    distance: float = 10.0,
+    sigma: Number = 0.005,
+    turn: tuple[Number, Number] = (20.0, 50.0),
+    distance: Number = 10.0,
 ) -> ScanPair:
-    """Two scans of a model, the sensor going round it by an angle drawn from ``turn``.
+    """Scan a model twice, the sensor going round it by an angle drawn from ``turn``.
 
     Args:
         seed: Anything ``numpy.random.default_rng`` takes.
         model: (m, 3) points of the whole surface around the origin, much denser than a scan.
         n: Points of each scan.
-        sigma: Standard deviation of the noise of each coordinate.
+        sigma: Standard deviation of the noise of each coordinate [length].
         turn: Range of the angle between the two directions of view [deg].
-        distance: Of the sensor from the origin of the model.
+        distance: How far the sensor is from the origin of the model [length].
 
     Raises:
         ValueError: As ``partial_scan``.
@@ -58,7 +62,7 @@ def scan_pair(
     axis = _unit(np.cross(view, rng.standard_normal(3)))
     angle = np.radians(rng.uniform(*turn))
     other = np.cos(angle) * view + np.sin(angle) * np.cross(axis, view)
-    frames = [Pose(random_rotation(rng), shift, np.ones(())) for shift in rng.uniform(-0.5, 0.5, (2, 3))]
+    frames = [Pose(draw_rotation(rng), shift, np.ones(())) for shift in rng.uniform(-0.5, 0.5, (2, 3))]
     scans = [
         pose.apply(partial_scan(rng, model, direction, n=n, sigma=sigma))
         for pose, direction in zip(frames, (view, other), strict=True)
@@ -71,9 +75,9 @@ def scan_pair(
 
 
 def partial_scan(
-    seed: Seed | np.random.Generator, model: Points, view: Vector, *, n: int, sigma: float, cells: int = 40
+    seed: Seed | np.random.Generator, model: Points, view: Vector, *, n: int, sigma: Number, cells: int = 40
 ) -> Points:
-    """``n`` points of the side of a model that is seen from a direction, with Gaussian noise.
+    """Scan the side of a model that is seen from a direction, with Gaussian noise.
 
     An orthographic depth image decides what is seen: in each of its cells the nearest points, and
     those less than one and a half cells behind them.
@@ -81,10 +85,13 @@ def partial_scan(
     Args:
         seed: A seed, or a generator to draw from.
         model: (m, 3) points of the whole surface.
-        view: From the model to the sensor.
+        view: The direction from the model to the sensor [-].
         n: Points to draw, again and again where fewer are seen.
-        sigma: Standard deviation of the noise of each coordinate.
+        sigma: Standard deviation of the noise of each coordinate [length].
         cells: Cells along the longest side of the model.
+
+    Returns:
+        (n, 3) points in the frame of the model [length].
 
     Raises:
         ValueError: If the model is no (m, 3) array of points, n or the view is nothing, or sigma below 0.

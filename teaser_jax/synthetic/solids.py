@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from teaser_jax.synthetic.models import Points, Seed
-from teaser_jax.synthetic.protocol import random_rotation
+from teaser_jax.synthetic.protocol import draw_rotation
 
 Kind = Literal["box", "ball", "rod", "ring", "cone"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -18,7 +18,7 @@ SKIN = 1e-9  # points this far inside another part are hidden
 
 
 class Part(NamedTuple):
-    """A solid about the origin: its area, points on its surface, and who is inside."""
+    """A ``Part`` is a solid about the origin: it has an area, is drawn from, and tells who is inside."""
 
     area: float
     sample: Callable[[np.random.Generator, int], Points]
@@ -28,13 +28,13 @@ class Part(NamedTuple):
 def random_solid(
     seed: Seed, *, kinds: Sequence[Kind] = KINDS, parts: int | tuple[int, int] = (7, 10), n: int = 20_000
 ) -> Points:
-    """Points, uniform on the surface of a union of solids of random sizes, places and directions.
+    """Draw points on a union of solids of random sizes, places and directions, uniform on its surface.
 
     Args:
         seed: Anything ``numpy.random.default_rng`` takes.
         kinds: The kinds of parts to draw from: a family of shapes.
         parts: Their number, or the range (low, high) from which it is drawn.
-        n: Points.
+        n: Number of points.
 
     Returns:
         (n, 3), the longest side of the bounding box being 1, around the origin.
@@ -50,7 +50,7 @@ def random_solid(
         raise ValueError(f"received parts = {parts} and n = {n}: expected at least one of each.")
     rng = np.random.default_rng(seed)
     placed = [
-        (_PARTS[kinds[int(rng.integers(len(kinds)))]](rng), random_rotation(rng), rng.uniform(-0.4, 0.4, 3))
+        (_PARTS[kinds[int(rng.integers(len(kinds)))]](rng), draw_rotation(rng), rng.uniform(-0.4, 0.4, 3))
         for _ in range(rng.integers(low, high + 1))
     ]
     points = np.zeros((0, 3))
@@ -62,7 +62,7 @@ def random_solid(
 
 
 def _on_surface(rng: np.random.Generator, placed: list[tuple], n: int) -> Points:
-    """About n points of the union, in random order: points of each part by area, but those inside another."""
+    """Draw about n points of the union, in random order: of each part by area, none inside another."""
     total = sum(part.area for part, _, _ in placed)
     kept = []
     for part, turn, shift in placed:
@@ -159,7 +159,7 @@ def _cone(rng: np.random.Generator) -> Part:
 
 
 def _enough(some: Callable[[], Points], n: int) -> Points:
-    """Rows drawn until there are n."""
+    """Draw rows until there are n."""
     found = some()
     while len(found) < n:
         found = np.concatenate([found, some()])

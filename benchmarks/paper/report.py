@@ -10,10 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from teaser_jax.files import FileError, whole
-from teaser_jax.studies.catalogue import LABELS, MATCHES, Measure, studies
-from teaser_jax.studies.claims import CLAIMS, COMPETITORS, Claim, Models, Verdict, median
+from benchmarks.paper.claims import CLAIMS, COMPETITORS, PaperClaim
+from benchmarks.paper.verdicts import Models, Verdict, median
+from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.io import FileError, os_errors_named, replacing
+from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.results import ABOUT, PICTURE, Results, read_results
+from teaser_jax.studies.study import LABELS, MATCHES, Measure
 
 MARKS = {True: "yes", False: "**no**", None: "-"}
 
@@ -26,6 +29,9 @@ def write_report(folder: str | Path, output: str | Path) -> Path:
             hold the same studies of other models, as ``FOLDER/bunny/known-scale``.
         output: The file, which appears whole or not at all. It shows the figures by relative paths.
 
+    Returns:
+        The file.
+
     Raises:
         FileError: If there is no study in the folder, a table is broken, or the file cannot be written.
     """
@@ -35,12 +41,9 @@ def write_report(folder: str | Path, output: str | Path) -> Path:
         raise FileError(f"{folder}: holds no study: run teaser-jax study first.")
     inner = {path.name: _studies_in(path) for path in sorted(folder.iterdir()) if path.name not in studies()}
     models = {name: some for name, some in inner.items() if some}
-    try:
-        with whole(output) as partial:
-            text = "\n".join(_report(found, models, folder, output.parent))
-            partial.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"{output}: cannot be written: {error.strerror or error}.") from error
+    with os_errors_named(output, "cannot be written"), replacing(output) as page:
+        text = "\n".join(_report(found, models, folder, output.parent))
+        page.write_text(text + "\n", encoding="utf-8")
     return output
 
 
@@ -53,8 +56,8 @@ def _report(found: dict[str, Results], models: Models, folder: Path, here: Path)
     yield ""
     yield (
         "*TEASER: Fast and Certifiable Point Cloud Registration* (Yang, Shi, Carlone, T-RO 2020), section "
-        "XI, by its protocol. `teaser-jax study all` fills the tables and `teaser-jax study report` writes "
-        "this page from them, on any machine."
+        "XI, by its protocol. `teaser-jax study all` fills the tables and `python -m benchmarks.paper` "
+        "writes this page from them, on any machine."
     )
     yield ""
     yield from _claims(found, models)
@@ -100,11 +103,11 @@ def _claims(found: dict[str, Results], models: Models) -> Iterator[str]:
     yield "|---|---|---|---|"
     for claim in CLAIMS:
         verdict = _verdict(claim, found, models)
-        yield f"| {claim.where} | {claim.said} | {verdict.found} | {MARKS[verdict.holds]} |"
+        yield f"| {claim.where} | {claim.text} | {verdict.found} | {MARKS[verdict.holds]} |"
     yield ""
 
 
-def _verdict(claim: Claim, found: dict[str, Results], models: Models) -> Verdict:
+def _verdict(claim: PaperClaim, found: dict[str, Results], models: Models) -> Verdict:
     if claim.of_models is not None:
         return claim.of_models(models)
     if claim.study is None or claim.test is None:
@@ -160,7 +163,7 @@ def _made_with(environments: list[dict[str, Any]]) -> Iterator[str]:
         yield ""
 
 
-def _grid(results: Results, methods: list[str], cell: Callable[[str, float], str]) -> Iterator[str]:
+def _grid(results: Results, methods: list[str], cell: Callable[[str, Number], str]) -> Iterator[str]:
     values = results.values
     heads = [f"{v:g}" if results.study.sweep == MATCHES else f"{v:.0%}" for v in values]
     yield f"| {LABELS[results.study.sweep]} | " + " | ".join(heads) + " |"
@@ -171,6 +174,6 @@ def _grid(results: Results, methods: list[str], cell: Callable[[str, float], str
     yield ""
 
 
-def _number(results: Results, method: str, value: float, measure: Measure) -> str:
+def _number(results: Results, method: str, value: Number, measure: Measure) -> str:
     number = median(results, method, value, measure.column)
     return "" if np.isnan(number) else f"{number:.2g}"

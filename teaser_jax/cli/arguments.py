@@ -1,0 +1,140 @@
+"""The arguments of the commands. Nothing is loaded here but argparse, so that help comes at once."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import NoReturn
+
+from teaser_jax import __version__
+from teaser_jax.cli.endings import BadInput
+
+PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")  # what matplotlib writes without further programs
+CLIQUES = ("exact", "greedy", "networkx", "none")
+ROTATIONS = ("gnc", "global", "sdp")
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise BadInput(f"{message}; see {self.prog} --help")
+
+
+def parser() -> argparse.ArgumentParser:
+    """Make the parser of the command line; ``command`` of what it returns names the module that runs."""
+    program = _Parser(
+        prog="teaser-jax",
+        description="Robust registration of matched 3-D points.",
+        epilog="Exit codes: 0 ok, 1 no trustworthy answer (the status says why), 2 bad input.",
+    )
+    program.add_argument("--version", action="version", version=f"teaser-jax {__version__}")
+    commands = program.add_subparsers(required=True, metavar="COMMAND", dest="command")
+    _add_register(commands.add_parser("register", help="find the pose behind a file of matches"))
+    _add_demo(
+        commands.add_parser("demo", help="register 1000 matches of which 950 are wrong, and draw the answer")
+    )
+    _add_study(
+        commands.add_parser("study", help="run the paper's studies: tables and figures of many problems")
+    )
+    return program
+
+
+def _add_register(register: argparse.ArgumentParser) -> None:
+    register.add_argument(
+        "matches", metavar="MATCHES", type=Path,
+        help=".npz with arrays src and dst, maybe also noise_bound, scale, cbar2, mask, confidence, pairs; "
+        "or text or CSV with six columns",
+    )  # fmt: skip
+    # Options that are not given stay absent: then the file speaks, then the defaults of tj.register.
+    absent = argparse.SUPPRESS
+    register.add_argument(
+        "--noise-bound", type=float, default=absent, metavar="B",
+        help="largest error of a right match, in the unit of the points (default: noise_bound in the file)",
+    )  # fmt: skip
+    register.add_argument(
+        "--scale", type=_scale, default=absent, metavar="S|estimate",
+        help="the known scale (default: scale in the file, or 1), or the word estimate",
+    )  # fmt: skip
+    register.add_argument(
+        "--cbar2", type=float, default=absent, metavar="C",
+        help="truncation of the cost (default: cbar2 in the file, or 1)",
+    )  # fmt: skip
+    register.add_argument(
+        "--clique", choices=CLIQUES, default=absent, help="how to prune wrong matches (default: exact)"
+    )
+    register.add_argument(
+        "--rotation", choices=ROTATIONS, default=absent, help="how to find the rotation (default: gnc)"
+    )
+    register.add_argument(
+        "--certify", action="store_true", help="prove how good the rotation is, and say so in the answer"
+    )
+    register.add_argument("--json", action="store_true", help="print the answer as JSON")
+    register.add_argument(
+        "--plot", type=_picture, metavar="PNG",
+        help="write a picture of the answer, good or bad: .png, .pdf, .svg or .jpg",
+    )  # fmt: skip
+    register.add_argument(
+        "-o", "--output", type=_output, metavar="TXT",
+        help="write T_dst_src, 4 x 4; if the answer cannot be trusted, an older file is removed instead",
+    )  # fmt: skip
+
+
+def _add_demo(demo: argparse.ArgumentParser) -> None:
+    demo.add_argument(
+        "--plot", type=_picture, default=Path("demo.png"), metavar="PNG", help="default: demo.png"
+    )
+    demo.add_argument("--seed", type=_seed, default=0, help="default: 0")
+
+
+def _add_study(study: argparse.ArgumentParser) -> None:
+    folder = Path("studies")
+    study.add_argument("name", metavar="NAME", help="list, a study that it names, or all")
+    study.add_argument(
+        "--folder", type=Path, default=folder, metavar="DIR",
+        help=f"of tables and figures (default: {folder})",
+    )  # fmt: skip
+    study.add_argument("--runs", type=int, metavar="N", help="problems a cell (default: 40 or 100)")
+    study.add_argument("--seed", type=int, default=0, metavar="S", help="default: 0")
+    study.add_argument(
+        "--model", default="procedural", metavar="PATH|procedural",
+        help="points or triangles to draw from: .npy, .ply, .obj, .stl, .off (default: procedural, a teapot)",
+    )  # fmt: skip
+    study.add_argument(
+        "--method", action="append", metavar="M", help="one that takes part, again for more (default: all)"
+    )
+    study.add_argument("--quick", action="store_true", help="a few cells of three runs: two minutes a study")
+    study.add_argument(
+        "--export", type=Path, metavar="DIR", help="write the problems as .npz shards, and solve nothing"
+    )
+    study.add_argument(
+        "--cluster", nargs="?", const="", metavar="HOST:PORT,N,K",
+        help="share the work among N processes, of which this is number K; alone, as Slurm or Open MPI say",
+    )  # fmt: skip
+    # Of the report that this command wrote once: whoever asks for it is told where it went.
+    study.add_argument("-o", "--output", type=Path, help=argparse.SUPPRESS)
+
+
+def _scale(text: str) -> float | None:
+    try:
+        return None if text == "estimate" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number nor the word estimate") from None
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text} is no seed: give a whole number, 0 or above")
+    return int(text)
+
+
+def _output(text: str) -> Path:
+    if text == "-":
+        raise argparse.ArgumentTypeError("- is not understood as standard output: name a file")
+    return Path(text)
+
+
+def _picture(text: str) -> Path:
+    path = _output(text)
+    if path.suffix.lower() not in PICTURES:
+        kinds = ", ".join(PICTURES[:-1])
+        raise argparse.ArgumentTypeError(f"{text}: unknown kind of picture: end the name in one of {kinds}")
+    return path

@@ -1,0 +1,149 @@
+"""Matches from archives and text."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from teaser_jax.ground.io import FileError, one_line, or_file_error, os_errors_named, read_archive
+from teaser_jax.pose import Pose
+
+TEXT = (".txt", ".csv", ".tsv", ".dat", ".xyz")
+CLOUDS = (".ply", ".pcd", ".las", ".laz", ".bin", ".npy", ".obj", ".stl")  # known to newcomers
+KNOWN = ("noise_bound", "scale", "cbar2", "mask", "confidence", "pairs")
+PANDAS_HEADER = ["0", "1", "2", "3", "4", "5"]  # the column names of a table that was given none
+
+
+@dataclass(frozen=True, eq=False)
+class MatchFile:
+    """A ``MatchFile`` holds what a file of matches says, as it stands there: nothing is checked yet.
+
+    Attributes:
+        src, dst: (n, 3) matched points, row i with row i [length].
+        known: Further arguments of ``register``, those of ``KNOWN`` that the file holds.
+        truth: The pose to compare with, from ``T_dst_src``; None: the file has none.
+    """
+
+    src: np.ndarray
+    dst: np.ndarray
+    known: dict[str, np.ndarray]
+    truth: Pose | None = None
+
+
+def read_matches(path: str | PathLike[str]) -> MatchFile:
+    """Read matches from ``.npz`` (arrays ``src`` and ``dst``) or text (six columns).
+
+    An archive may also hold ``noise_bound``, ``scale``, ``cbar2``, ``mask``, ``confidence``,
+    ``pairs`` and ``T_dst_src``. Text has a row for each match, x y z of the source point, then of
+    the target point, separated by white space, commas, semicolons, tabs or bars; one line of
+    column names (also 0 to 5, which pandas writes) and ``#`` comments are skipped. The points are
+    checked by ``register``.
+
+    Args:
+        path: A file that ends in .npz, .txt, .csv, .tsv, .dat or .xyz.
+
+    Raises:
+        FileError: If there is no such file, or it is broken, or holds something else.
+    """
+    path = Path(path)
+    with os_errors_named(path, "cannot be read"):
+        try:
+            return _reader(path)(path)
+        except FileNotFoundError:
+            raise FileError(f"{path}: no such file: check the name.") from None
+
+
+def _reader(path: Path) -> Callable[[Path], MatchFile]:
+    """Choose by the extension who reads a file, or raise FileError."""
+    if path.is_dir():
+        raise FileError(f"{path}: is a folder: name the file of matches in it.")
+    readers = {".npz": _read_npz, **dict.fromkeys(TEXT, _read_text)}
+    suffix, kinds = path.suffix.lower(), ", ".join(readers)
+    if suffix in CLOUDS:
+        raise FileError(
+            f"{path}: is a cloud, and matches are needed: match the two clouds first, and save row i "
+            f"of one with row i of the other as one of {kinds}."
+        )
+    if suffix not in readers:
+        raise FileError(f"{path}: unknown extension '{path.suffix}': give matches as one of {kinds}.")
+    return readers[suffix]
+
+
+def _read_npz(path: Path) -> MatchFile:
+    arrays = read_archive(path)
+    for name in ("src", "dst"):
+        if name not in arrays:
+            found = ", ".join(sorted(arrays)) or "nothing"
+            raise FileError(
+                f"{path}: holds no array '{name}' (found: {one_line(found, 80)}): "
+                "save one with numpy.savez(path, src=src, dst=dst)."
+            )
+    known = {name: arrays[name] for name in KNOWN if name in arrays}
+    truth = None
+    if "T_dst_src" in arrays:
+        truth = or_file_error(
+            path, "T_dst_src is no pose", lambda: Pose.from_matrix(_finite(arrays["T_dst_src"]))
+        )
+    return MatchFile(arrays["src"], arrays["dst"], known, truth)
+
+
+def _read_text(path: Path) -> MatchFile:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise FileError(f"{path}: is not text: expected six columns of numbers.") from None
+    numbered = ((number, line.split("#")[0]) for number, line in enumerate(lines, 1))
+    rows = [(number, line) for number, line in numbered if line.strip()]
+    delimiter = next((d for d in ";,\t|" if rows and d in rows[0][1]), None)
+    if rows and _is_header(_fields(rows[0][1], delimiter)):
+        rows = rows[1:]
+    if not rows:
+        raise FileError(f"{path}: holds no match: expected six numbers a row.")
+    reason = ""
+    try:
+        table = np.loadtxt([line.replace('"', "") for _, line in rows], delimiter=delimiter, ndmin=2)
+    except ValueError as error:
+        table, reason = np.empty((0, 0)), str(error)
+    if table.shape[1] != 6:
+        for number, line in rows:
+            _check_line(f"{path}: line {number}", _fields(line, delimiter))
+        raise FileError(f"{path}: cannot be read ({one_line(reason)}): expected six numbers a row.")
+    return MatchFile(table[:, :3], table[:, 3:], {})
+
+
+def _fields(line: str, delimiter: str | None) -> list[str]:
+    return [field.strip().strip('"') for field in line.split(delimiter)]
+
+
+def _is_header(fields: list[str]) -> bool:
+    """Whether a first row holds column names; one that is partly numbers is an error instead."""
+    return fields == PANDAS_HEADER or not any(_is_number(field) for field in fields)
+
+
+def _check_line(where: str, fields: list[str]) -> None:
+    if len(fields) != 6:
+        raise FileError(
+            f"{where} has {len(fields)} columns: expected six, x y z of the source point, then of the target."
+        )
+    for field in fields:
+        if not _is_number(field):
+            raise FileError(f"{where} holds '{one_line(field, 40)}': expected six numbers.")
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return True
+
+
+def _finite(array: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    if array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+        raise ValueError("not all finite numbers")
+    return array.astype(np.float64)
