@@ -8,7 +8,8 @@ import pytest
 from numpy.testing import assert_allclose
 from oracles import BOUND, best_rotation, draw_vectors, rotation_cost, tampered, turned
 
-from teaser_jax import CertificateStatus, CertifiedBy, certify_rotation, verify
+from teaser_jax import certify_rotation, verify
+from teaser_jax.certify.certificate import CertificateStatus, CertifiedBy
 
 OPEN = (CertificateStatus.UNKNOWN, CertificateStatus.SUBOPTIMAL)
 

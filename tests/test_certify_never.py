@@ -8,7 +8,8 @@ import pytest
 from oracles import BOUND, draw_vectors, rotation_cost, tampered, turned
 
 import teaser_jax as tj
-from teaser_jax import CertificateStatus, certify_rotation, verify
+from teaser_jax import certify_rotation, verify
+from teaser_jax.certify.certificate import CertificateStatus
 
 TOLERANCE = 1e-3
 RATES = (0.0, 0.2, 0.5, 0.8, 0.9, 1.0)

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import teaser_jax as tj
-from teaser_jax import CertificateStatus
+from teaser_jax.certify.certificate import CertificateStatus, CertifiedBy
 
 
 @pytest.mark.parametrize("about", ["pose", "chain", "complete"])
@@ -136,7 +136,7 @@ def test_after_warmup_certificates_compile_nothing():
     jax.monitoring.register_event_duration_secs_listener(listener)
     drawn = tj.synthetic.random_problem(0, n=16, outlier_rate=0.5)
     result = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, certify=True)
-    assert result.certificate.method == tj.CertifiedBy.DIRECT
+    assert result.certificate.method == CertifiedBy.DIRECT
     for rotation in (np.eye(3), -result.pose.rotation):  # neither is a proof by the closed form
         other = replace(result.solution, pose=replace(result.pose, rotation=rotation))
         assert not tj.certify(result.problem, other, iterations=7).is_optimal

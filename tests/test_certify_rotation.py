@@ -9,7 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 from oracles import BOUND, draw_vectors, rotation_cost, tampered, turned
 
-from teaser_jax import CertificateStatus, CertifiedBy, certify_rotation
+from teaser_jax import certify_rotation
+from teaser_jax.certify.certificate import CertificateStatus, CertifiedBy
 from teaser_jax.certify.dual import Dual
 from teaser_jax.certify.verify import verify
 from teaser_jax.so3 import rotation_angle

@@ -11,7 +11,7 @@ import pytest
 from oracles import BOUND, best_rotation, draw_vectors, rotation_cost
 
 import teaser_jax as tj
-from teaser_jax import CertificateStatus, CertifiedBy
+from teaser_jax.certify.certificate import CertificateStatus, CertifiedBy
 from teaser_jax.certify.dual import Dual, dual_matrix
 from teaser_jax.certify.relaxation import turned_dual
 from teaser_jax.stages.rotation.quadratic_form import Measurements, cost_matrix

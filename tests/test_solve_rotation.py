@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from oracles import BOUND, draw_vectors, rotation_cost
 
 import teaser_jax as tj
-from teaser_jax import CertificateStatus
+from teaser_jax.certify.certificate import CertificateStatus
 from teaser_jax.so3 import rotation_angle
 
 

@@ -296,7 +296,7 @@ def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
 
 
 class _Once:
-    """It runs something the first time a size comes, so that no compilation is timed, nor a start of threads."""
+    """It runs something the first time a size comes, so that no compilation is timed, no start of threads."""
 
     def __init__(self) -> None:
         self.seen: set[int] = set()
