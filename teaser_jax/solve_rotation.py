@@ -104,15 +104,15 @@ def solve_rotation(
     References: Yang, Shi, Carlone, T-RO 2020, section VIII, (12), (19), (23), Theorem 13; GNC: Yang,
     Antonante, Tzoumas, Carlone, RA-L 2020.
     """
-    method = as_record("method", method, ROTATIONS)
-    check_record("method", method, ROTATIONS)
+    chosen: RotationMethod = as_record("method", method, ROTATIONS)
+    check_record("method", chosen, ROTATIONS)
     one_of("proof", proof, (*get_args(CertifyMethod), None))
     _check_vectors(src, dst)
     options = checked_options(tolerance, iterations, proof or "splitting", MAX_MEASUREMENTS)
     mask = np.ones(np.shape(src)[0], bool) if mask is None else mask
     known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
     how = _traced if is_traced(src, dst, known, tolerance) else _on_host
-    return how(src, dst, **known, method=method, options=options, certified=proof is not None)
+    return how(src, dst, **known, method=chosen, options=options, certified=proof is not None)
 
 
 def _check_vectors(src: Any, dst: Any) -> None:
