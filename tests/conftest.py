@@ -11,6 +11,23 @@ import pytest
 
 import teaser_jax as tj
 
+# Warnings are errors from the collection on: not in pyproject.toml, where a plugin of another package that
+# warns while pytest starts would stop it. Later lines win.
+WARNINGS = (
+    "error",
+    # Raised while importing or closing other people's code, which nothing here can change.
+    "ignore::DeprecationWarning:jupyter_client",
+    "ignore::DeprecationWarning:nbclient",
+    "ignore::DeprecationWarning:zmq",
+    "ignore::DeprecationWarning:(matplotlib|pyparsing)",  # 3.9 with a newer pyparsing
+    "ignore::ImportWarning:networkx",  # 3.0 without pandas
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for line in WARNINGS:
+        config.addinivalue_line("filterwarnings", line)
+
 
 @pytest.fixture
 def x64() -> Iterator[None]:
