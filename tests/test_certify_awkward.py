@@ -197,15 +197,14 @@ def test_more_than_it_can_look_at():
 @pytest.mark.parametrize("method", ["direct", "splitting", "reference"])
 def test_unused_rows_may_stand_anywhere(unused, method):
     # Once padding was looked for at the end only, and the bound of a wrong candidate lay above the optimum.
+    known = dict(noise_bound=BOUND, method=method, iterations=5)
+    inside = jax.jit(lambda a, b, r, m: certify_rotation(a, b, r, mask=m, **known))
     for seed in range(4):
         src, dst, truth = draw_vectors([17, seed], 12, 0.3)
         candidate, mask = turned(truth, 120, seed), np.ones(12, bool)
-        known = dict(noise_bound=BOUND, method=method, iterations=5)
         if unused == "masked":
             mask[:4] = False
-            found = jax.jit(lambda a, b, r, m, k=known: certify_rotation(a, b, r, mask=m, **k))(
-                src, dst, candidate, mask
-            )
+            found = inside(src, dst, candidate, mask)
         else:
             src[:4] = 0.0 if unused == "zero" else np.nan
             found = certify_rotation(src, dst, candidate, **known)

@@ -8,14 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles import problem_of, random_matches
+from oracles import problem_of, random_matches, solve
 from scipy.stats import chi2
 
 import teaser_jax as tj
 
-N, RUNS, SIGMA = 40, 300, 0.01
+N, RUNS, SIGMA = 32, 300, 0.01
 GREEDY = tj.Settings(clique="greedy")
 CONVENTIONS = ("right", "gtsam", "g2o", "ros")
+# One program for all: each by itself takes as long to compile.
+in_all_conventions = jax.jit(
+    lambda problem, solution: [tj.covariance(problem, solution, SIGMA, convention=c) for c in CONVENTIONS]
+)
 
 
 def error_between(answer: tj.Pose, truth: tj.Pose, convention: str, unknown: bool) -> jax.Array:
@@ -81,10 +85,9 @@ def test_errors_are_as_large_as_the_covariance_says(scale, refine, x64):
 
 def test_covariance_and_information_are_inverse_and_symmetric(x64):
     problem = problem_of(random_matches(4, N, wrong=0.3), scale=None)
-    solution = jax.jit(tj.solve)(problem)
-    for convention in CONVENTIONS:
-        found = tj.covariance(problem, solution, SIGMA, convention=convention)
-        assert found.convention == convention
+    several = in_all_conventions(problem, solve(problem))
+    assert [found.convention for found in several] == list(CONVENTIONS)
+    for found in several:
         np.testing.assert_allclose(found.covariance @ found.information, np.eye(7), atol=1e-8)
         np.testing.assert_allclose(found.covariance, found.covariance.T, atol=1e-18)
         np.testing.assert_array_less(0, np.linalg.eigvalsh(found.covariance))
@@ -93,8 +96,8 @@ def test_covariance_and_information_are_inverse_and_symmetric(x64):
 def test_least_squares_has_the_covariance_of_its_normal_equations(x64):
     matches = random_matches(5, N, wrong=0.0, noise=0.1)
     problem = problem_of(matches)
-    found = tj.covariance(problem, jax.jit(tj.solve)(problem), SIGMA)
-    rotation = np.asarray(jax.jit(tj.solve)(problem).pose.rotation)
+    solution = solve(problem)
+    found, rotation = tj.covariance(problem, solution, SIGMA), solution.pose.rotation
     rows = [np.hstack([-rotation @ np.asarray(tj.so3.hat(a)), rotation]) for a in matches.src]
     information = sum(row.T @ row for row in rows) / SIGMA**2
     np.testing.assert_allclose(found.information, information, rtol=0.02, atol=1e-3 * information.max())
@@ -113,14 +116,14 @@ def test_the_deviation_can_be_estimated():
 
 def test_an_answer_that_failed_knows_nothing(x64):
     problem = problem_of(random_matches(14, N, wrong=1.0))
-    found = tj.covariance(problem, jax.jit(tj.solve)(problem), SIGMA)
+    found = tj.covariance(problem, solve(problem), SIGMA)
     np.testing.assert_array_equal(found.information, 0)
     assert np.all(np.isinf(np.diag(found.covariance)))
 
 
 def test_no_noise_is_exact(x64):
     problem = problem_of(random_matches(7, N, wrong=0.3))
-    found = tj.covariance(problem, jax.jit(tj.solve)(problem), 0.0)
+    found = tj.covariance(problem, solve(problem), 0.0)
     np.testing.assert_array_equal(found.covariance, 0)
     assert np.all(np.isinf(np.diag(found.information)))
 
@@ -140,7 +143,7 @@ def test_bad_arguments_are_told_apart():
 def test_the_difference_of_equal_poses_is_zero_and_has_a_finite_gradient(x64):
     pose = jax.tree.map(jnp.asarray, random_matches(0).truth)
     np.testing.assert_allclose(tj.pose_difference(pose, pose), 0, atol=1e-15)
-    slope = jax.grad(lambda p: jnp.sum(tj.pose_difference(p, pose, with_scale=True)))(pose)
+    slope = jax.jit(jax.grad(lambda p: jnp.sum(tj.pose_difference(p, pose, with_scale=True))))(pose)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(slope))
 
 
