@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import teaser_jax as tj
 
-# Compiled once for all test files, at one size where the size does not matter: most of a test's time is XLA's.
+# Compiled once for all test files, of one size where sizes do not matter: most of a test's time is XLA's.
 _solve = jax.jit(tj.solve)
 _solve_stack = jax.jit(jax.vmap(tj.solve))
 refit = jax.jit(tj.refit)

@@ -144,6 +144,7 @@ def test_what_is_no_rotation_is_projected(make):
     assert not (found.is_optimal and found.cost > best_rotation(src, dst)[1] * 1.001 + 1e-6)
 
 
+@pytest.mark.long
 def test_not_a_number_anywhere():
     src, dst, rotation = draw_vectors(7, 12, 0.0)
     odd = dst.copy()
@@ -193,6 +194,7 @@ def test_more_than_it_can_look_at():
     assert found.lower_bound == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unused", ["zero", "nan", "masked"])
 @pytest.mark.parametrize("method", ["direct", "splitting", "reference"])
 def test_unused_rows_may_stand_anywhere(unused, method):
@@ -215,6 +217,7 @@ def test_unused_rows_may_stand_anywhere(unused, method):
         assert_allclose(float(found.lower_bound) - resting, last.lower_bound, atol=2e-2)
 
 
+@pytest.mark.long
 def test_numbers_of_all_kinds_under_jit():
     src, dst, rotation = draw_vectors(0, 6, 0.0)
     whole = np.round(src * 20).astype(np.int32)

@@ -25,6 +25,7 @@ SPOIL = (
     lambda r: r + 0.05 * np.outer([1, -1, 0], [0, 1, 1]),
 )
 
+
 @jax.jit
 @jax.vmap
 def best_of_each(src, dst, bound, mask):
@@ -85,6 +86,7 @@ def false_claims(k: int, rate: float, count: int, bound: float = BOUND, **how) -
     return wrong, made
 
 
+@pytest.mark.long
 def test_no_false_claim_among_hundreds():
     total = 0
     for k, rate in ((8, 0.0), (8, 0.1), (8, 0.8), (8, 1.0)):
@@ -94,12 +96,14 @@ def test_no_false_claim_among_hundreds():
     assert total > 10
 
 
+@pytest.mark.long
 def test_no_false_claim_after_iterations():
     wrong, made = false_claims(8, 0.5, 40, iterations=30)
     assert wrong == 0
     assert made > 5
 
 
+@pytest.mark.long
 def test_bounds_that_only_float32_would_support():
     # The gap asked for is below what float64 resolves: nothing is claimed that the verifier cannot confirm.
     for bound in (1e-6, 1e-8):

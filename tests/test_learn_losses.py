@@ -12,7 +12,6 @@ from oracles import random_pose
 import teaser_jax as tj
 from teaser_jax import learn
 
-
 # Step by step each loss compiles dozens of programs.
 matching_loss = jax.jit(learn.matching_loss)
 
@@ -40,9 +39,7 @@ def test_pose_losses_take_batches(x64):
     for loss in (learn.rotation_loss, learn.translation_loss, lambda a, b: learn.point_loss(a, b, points)):
         assert jax.eval_shape(loss, several, others).shape == (2,)
     rotation_loss = jax.jit(learn.rotation_loss)
-    np.testing.assert_allclose(
-        rotation_loss(several, others)[1], rotation_loss(pose(1), pose(3)), rtol=1e-12
-    )
+    np.testing.assert_allclose(rotation_loss(several, others)[1], rotation_loss(pose(1), pose(3)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])

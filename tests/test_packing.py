@@ -22,6 +22,7 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_nothing_is_lost(case, x64):
     known = dict(CASES[case])

@@ -50,6 +50,7 @@ def test_everything_is_numpy_in_float64(result):
         assert leaf.dtype.kind != "f" or leaf.dtype == np.float64
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1.0, None], ids=["known scale", "voted scale"])
 def test_solve_gives_the_same_sets_and_pose(scale, x64):
     n = 30  # padded to 32, for which the tests of solve have a program
@@ -68,6 +69,7 @@ def test_solve_gives_the_same_sets_and_pose(scale, x64):
     assert ours.status == theirs.status
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1.0, None], ids=["known scale", "voted scale"])
 @pytest.mark.parametrize("refined", [True, False])
 def test_the_pose_is_the_refit_of_its_own_selection(problem, scale, refined, x64):
@@ -111,6 +113,7 @@ def test_masked_and_weightless_rows_are_left_out(problem):
     np.testing.assert_allclose(by_mask.pose.matrix, by_weight.pose.matrix, atol=1e-14)
 
 
+@pytest.mark.long
 def test_duplicates_and_many_to_one_matches_do_no_harm(problem):
     twice = tj.register(
         np.concatenate([problem.src, problem.src[:4]]),
@@ -125,6 +128,7 @@ def test_duplicates_and_many_to_one_matches_do_no_harm(problem):
     assert found.inliers[crowded.inliers].mean() > 0.95
 
 
+@pytest.mark.long
 def test_pairs_and_graphs_of_pairs_are_the_same(problem):
     pairs = np.array([(i, j) for i in range(N) for j in range(i + 1, N) if (i + j) % 3])
     graph = nx.Graph(pairs.tolist())
@@ -188,6 +192,7 @@ def test_eight_programs_serve_a_stream():
     assert len({sizes[n] for n in range(300, 6001)}) <= 8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("most", "stream"),
     [
@@ -223,6 +228,7 @@ def test_warmup_wants_a_size(max_points):
         tj.warmup(max_points)
 
 
+@pytest.mark.long
 def test_profile_names_every_stage(problem, result):
     profile = tj.profile(problem.src, problem.dst, noise_bound=problem.noise_bound, repeats=1)
     assert profile.warm.keys() == profile.cold.keys()

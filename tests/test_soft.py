@@ -63,6 +63,7 @@ def slope_of_pose(problem, cotangent) -> np.ndarray:
     return both_ways(problem, 1.0, still, (cotangent, np.zeros(N)))[1]["dst"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "scale", [pytest.param(1.3, id="known"), pytest.param(None, id="unknown", marks=pytest.mark.slow)]
 )
@@ -90,6 +91,7 @@ def test_forward_reverse_and_central_differences_agree(scale, x64):
         np.testing.assert_allclose(np.sum(gradient[name] * direction[name]), combined, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.long
 def test_unrolling_the_iteration_gives_the_same_gradient(x64):
     problem = blurred(12, scale=1.3)
     start = soften(problem, 1.0).pose
@@ -111,6 +113,7 @@ def _pose(problem: tj.Problem) -> tj.Pose:
     return tj.soft_solve(problem).pose
 
 
+@pytest.mark.long
 def test_matches_near_the_threshold_have_a_gradient_that_solve_lacks(x64):
     problem = blurred(11, scale=1.3)
     found = soften(problem, 1.0)
@@ -123,6 +126,7 @@ def test_matches_near_the_threshold_have_a_gradient_that_solve_lacks(x64):
     np.testing.assert_array_equal(hard["dst"][out], 0)
 
 
+@pytest.mark.long
 def test_a_stiff_control_gives_the_answer_of_solve(x64):
     problem = problem_of(random_matches(13, N, wrong=0.4), scale=None)
     stiff = soften(problem, 1e6)
@@ -131,6 +135,7 @@ def test_a_stiff_control_gives_the_answer_of_solve(x64):
     assert stiff.cost == pytest.approx(float(stiff.solution.cost), rel=1e-6)
 
 
+@pytest.mark.long
 def test_the_cost_is_stationary_and_least(x64):
     problem = blurred(14, scale=None)
     found = soften(problem, 1.0)
@@ -156,6 +161,7 @@ def test_weights_are_the_slope_of_the_cost(x64):
         assert np.all(np.isfinite(jax.vmap(jax.grad(gnc_weights), (0, None, None))(r2, mu, 1.0)))
 
 
+@pytest.mark.long
 def test_hopeless_items_are_finite_say_so_and_spoil_none(x64):
     good = blurred(15, scale=None)
     line = np.zeros((N, 3))
@@ -185,6 +191,7 @@ def test_hopeless_items_are_finite_say_so_and_spoil_none(x64):
     np.testing.assert_array_equal(slopes[1][1:5], 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mu", [0.0, -1.0, np.nan, np.inf])
 def test_a_control_that_makes_no_sense_is_no_success(mu, x64):
     found = soften(blurred(11), mu)
@@ -202,6 +209,7 @@ def test_impossible_controls_are_refused_outside_jit():
             tj.soft_solve(problem, iterations=iterations)
 
 
+@pytest.mark.long
 def test_a_wrong_match_may_be_as_far_away_as_it_likes():
     """The middle about which poses vary took part in wrong matches: DEGENERATE, where ``solve`` is OK."""
     drawn = tj.synthetic.random_problem(0, n=100, outlier_rate=0.5)

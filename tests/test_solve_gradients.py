@@ -43,6 +43,7 @@ def slopes_of_stack(inputs, problems):
     return jax.vmap(jax.grad(total))(inputs, problems)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scale", "settings"),
     [(1.3, tj.Settings()), (None, CASCADE), (1.3, replace(CASCADE, tim_graph="complete"))],
@@ -75,6 +76,7 @@ def test_forward_reverse_and_central_differences_agree(scale, settings, x64):
         assert np.any(np.abs(forward) > 1e-6), name
 
 
+@pytest.mark.long
 def test_dead_rows_have_no_gradient_and_spoil_none(x64):
     settings, cotangent = tj.Settings(), np.random.default_rng(1).normal(size=(4, 4))
     problem = problem_of(matches_of(12), scale=1.3)
@@ -98,6 +100,7 @@ def test_dead_rows_have_no_gradient_and_spoil_none(x64):
     assert_finite(solve(spoiled))
 
 
+@pytest.mark.long
 def test_a_hopeless_item_leaves_its_neighbours_untouched(x64):
     good = problem_of(matches_of(13), scale=None)
     poisoned = [
@@ -121,6 +124,7 @@ def test_a_hopeless_item_leaves_its_neighbours_untouched(x64):
     np.testing.assert_array_equal(answers[1].status[1:], expected)
 
 
+@pytest.mark.long
 def test_ambiguous_poses_have_gradient_zero_and_no_ok(x64):
     rng = np.random.default_rng(0)
     line = rng.uniform(-1, 1, (N, 1)) * [1.0, 2.0, 2.0]
@@ -137,6 +141,7 @@ def test_ambiguous_poses_have_gradient_zero_and_no_ok(x64):
     np.testing.assert_array_equal(solve_stack(batch).ok, [False, False, False, True])
 
 
+@pytest.mark.long
 def test_single_precision_follows_double():
     matches, cotangent = matches_of(11), np.random.default_rng(0).normal(size=(4, 4))
 
@@ -153,6 +158,7 @@ def test_single_precision_follows_double():
         np.testing.assert_allclose(found, exact[name], atol=1e-3 * size, err_msg=name)
 
 
+@pytest.mark.long
 def test_descent_through_the_solver_finds_what_distorts_its_input():
     # One axis of the source is stretched; the true poses are known, half of the matches are wrong.
     drawn = [random_matches(k, N, wrong=0.5, noise=0.2) for k in range(6)]

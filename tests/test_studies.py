@@ -61,6 +61,7 @@ def quick(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_killed_study_loses_and_repeats_no_row(tmp_path):
     table, runs = tmp_path / "translation" / "table.csv", 30
     command = [*COMMAND, "translation", "--folder", str(tmp_path), "--runs", str(runs), "--method", "TLS"]
@@ -83,6 +84,7 @@ def test_a_killed_study_loses_and_repeats_no_row(tmp_path):
     )
 
 
+@pytest.mark.long
 def test_two_processes_write_the_rows_of_one(quick, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -160,6 +162,7 @@ def test_a_model_that_cannot_be_drawn_from_leaves_no_folder(tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.long
 def test_figures_without_a_place_are_said(quick, tmp_path):
     folder = shutil.copytree(quick, tmp_path / "studies")
     picture = folder / "known-scale" / "figure.png"
@@ -222,6 +225,7 @@ def test_a_broken_table_is_named(tmp_path, content, said):
         read_table(tmp_path / "t.csv")
 
 
+@pytest.mark.long
 def test_answers_are_right_and_all_methods_see_the_same_problems(quick):
     results = read_results(quick / "known-scale")
     assert results.values == [0.0, 0.5, 0.9]
@@ -235,6 +239,7 @@ def test_answers_are_right_and_all_methods_see_the_same_problems(quick):
     assert results.measured("teaser_jax", 0.5, "together").tolist() == [2, 2]
 
 
+@pytest.mark.long
 def test_the_figure_is_drawn_and_the_page_stands_alone(quick):
     place = quick / "known-scale"
     assert (place / "figure.png").read_bytes().startswith(b"\x89PNG")
@@ -247,6 +252,7 @@ def test_the_figure_is_drawn_and_the_page_stands_alone(quick):
     assert about["made_with"][0]["versions"]["jax"]
 
 
+@pytest.mark.long
 def test_the_report_has_a_row_for_every_figure_table_and_competitor(quick, tmp_path):
     path = write_report(quick, tmp_path / "PAPER.md")
     text = path.read_text()
@@ -266,6 +272,7 @@ def test_the_report_has_a_row_for_every_figure_table_and_competitor(quick, tmp_p
         write_report(tmp_path, tmp_path / "none.md")
 
 
+@pytest.mark.long
 def test_the_report_tells_of_other_models_in_folders_of_their_own(quick, tmp_path):
     folder = shutil.copytree(quick, tmp_path / "studies")
     cloud = Model("cloud", np.random.default_rng(0).standard_normal((400, 3)))
@@ -278,6 +285,7 @@ def test_the_report_tells_of_other_models_in_folders_of_their_own(quick, tmp_pat
     assert "### cloud" not in write_report(quick, tmp_path / "alone.md").read_text()
 
 
+@pytest.mark.long
 def test_claims_are_tested_and_not_believed(quick):
     results = read_results(quick / "known-scale")
     assert robust_to("teaser_jax", 0.9)(results).holds is True

@@ -38,6 +38,7 @@ def test_three_clean_matches_among_few_are_not_beyond_chance():
     assert status(src, moved(src)) == tj.Status.NO_CONSENSUS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [32, 64, 256])
 @pytest.mark.parametrize("seed", range(5))
 def test_wrong_matches_are_never_ok(n, seed):
@@ -82,6 +83,7 @@ def test_the_first_failure_sticks():
     assert status(src, src, mask=np.arange(40) < 1) == tj.Status.TOO_FEW_POINTS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "cap", [dict(gnc_iterations=1, refine=False), dict(refine_iterations=1)], ids=["GNC", "refinement"]
 )
@@ -119,6 +121,7 @@ def test_inliers_that_huddle_count_as_chance(x64):
 # --- evidence that is none ------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_copies_of_a_match_are_no_evidence(seed):
     # Thirty wrong matches, each listed sixteen times: three of them that agree look like 48.
@@ -127,6 +130,7 @@ def test_copies_of_a_match_are_no_evidence(seed):
     assert status(src, dst, settings=tj.Settings(clique_seconds=1.0)) != tj.Status.OK
 
 
+@pytest.mark.long
 def test_copies_do_no_harm_either():
     problem = random_problem(2, n=50, outlier_rate=0.5)
     twice = [np.concatenate([x, x]) for x in (problem.src, problem.dst)]
@@ -157,6 +161,7 @@ def test_a_pose_that_two_matches_hold_is_not_determined():
     assert status(problem.src, problem.dst, confidence=np.full(100, 1e-12), **known) == tj.Status.OK
 
 
+@pytest.mark.long
 def test_a_scale_out_of_its_range_has_no_consensus():
     problem = random_problem(0, n=100, outlier_rate=0.5)
     known = dict(noise_bound=problem.noise_bound, scale=None)
@@ -169,6 +174,7 @@ def test_a_scale_out_of_its_range_has_no_consensus():
         assert status(problem.src, problem.dst, settings=settings, **known) == expected
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flat", [1.0, 0.3, 0.1])
 @pytest.mark.parametrize("axis", range(3))
 def test_a_flat_cloud_mirrored_has_no_pose_either(flat, axis):

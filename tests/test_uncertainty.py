@@ -39,6 +39,7 @@ def error_between(answer: tj.Pose, truth: tj.Pose, convention: str, unknown: boo
     return jnp.concatenate([*found, *last])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scale", "refine"),
     [
@@ -83,6 +84,7 @@ def test_errors_are_as_large_as_the_covariance_says(scale, refine, x64):
         np.testing.assert_allclose(other, squares[:, 0], rtol=0.05)
 
 
+@pytest.mark.long
 def test_covariance_and_information_are_inverse_and_symmetric(x64):
     problem = problem_of(random_matches(4, N, wrong=0.3), scale=None)
     several = in_all_conventions(problem, solve(problem))
@@ -93,6 +95,7 @@ def test_covariance_and_information_are_inverse_and_symmetric(x64):
         np.testing.assert_array_less(0, np.linalg.eigvalsh(found.covariance))
 
 
+@pytest.mark.long
 def test_least_squares_has_the_covariance_of_its_normal_equations(x64):
     matches = random_matches(5, N, wrong=0.0, noise=0.1)
     problem = problem_of(matches)
@@ -103,6 +106,7 @@ def test_least_squares_has_the_covariance_of_its_normal_equations(x64):
     np.testing.assert_allclose(found.information, information, rtol=0.02, atol=1e-3 * information.max())
 
 
+@pytest.mark.long
 def test_the_deviation_can_be_estimated():
     matches = random_matches(6, 400, wrong=0.2, noise=0.0, noise_bound=0.06)
     rng = np.random.default_rng(0)
@@ -114,6 +118,7 @@ def test_the_deviation_can_be_estimated():
     np.testing.assert_allclose(guessed.covariance, told.covariance, rtol=0.1)
 
 
+@pytest.mark.long
 def test_an_answer_that_failed_knows_nothing(x64):
     problem = problem_of(random_matches(14, N, wrong=1.0))
     found = tj.covariance(problem, solve(problem), SIGMA)
@@ -121,6 +126,7 @@ def test_an_answer_that_failed_knows_nothing(x64):
     assert np.all(np.isinf(np.diag(found.covariance)))
 
 
+@pytest.mark.long
 def test_no_noise_is_exact(x64):
     problem = problem_of(random_matches(7, N, wrong=0.3))
     found = tj.covariance(problem, solve(problem), 0.0)
@@ -162,6 +168,7 @@ def test_a_stack_and_a_solution_of_another_problem_are_refused():
         tj.covariance(result.problem, other.solution)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1.0, None])
 @pytest.mark.parametrize("offset", [100.0, 1000.0])
 def test_far_origins_keep_a_finite_information(scale, offset):
