@@ -31,7 +31,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Workers take whole files: those with most to compile first, so that none of these is left to the end."""
+    """Workers take whole files: those with most to compile come first, so that none is left to the end."""
     weight = Counter(item.path for item in items if item.get_closest_marker("long"))
     items.sort(key=lambda item: -weight[item.path])  # stable: within a file nothing moves
 
