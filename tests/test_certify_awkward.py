@@ -22,6 +22,12 @@ def sound(src, dst, rotation, found) -> bool:
     return true and (not found.is_optimal or verify(src, dst, rotation, found, noise_bound=BOUND))
 
 
+@jax.jit
+def with_odd_mask(src, dst, rotation, bound):
+    """A certificate of 12 measurements inside jit, all of which a mask of numbers chooses."""
+    return certify_rotation(src, dst, rotation, noise_bound=bound, mask=[2] * 12)
+
+
 def test_no_measurements():
     found = certify_rotation(np.zeros((0, 3)), np.zeros((0, 3)), np.eye(3), noise_bound=BOUND)
     assert found.status == CertificateStatus.NO_MEASUREMENTS
@@ -155,9 +161,8 @@ def test_not_a_number_anywhere():
     assert found.is_optimal
     assert found.measurements == 11
     # Inside jit nothing can be raised: nothing is claimed instead.
-    jitted = jax.jit(lambda r, bound: certify_rotation(src, dst, r, noise_bound=bound))
     for r, bound in ((np.full((3, 3), np.nan), BOUND), (best, np.nan), (best, 0.0), (best, -1.0)):
-        inside = jitted(r, bound)
+        inside = with_odd_mask(src, dst, r, bound)
         known = rotation_cost(src, dst, best)
         assert not bool(inside.is_optimal) or (bound == BOUND and float(inside.cost) <= 1.001 * known)
 
@@ -219,18 +224,18 @@ def test_unused_rows_may_stand_anywhere(unused, method):
 
 @pytest.mark.long
 def test_numbers_of_all_kinds_under_jit():
-    src, dst, rotation = draw_vectors(0, 6, 0.0)
+    src, dst, rotation = draw_vectors(0, 12, 0.0)
     whole = np.round(src * 20).astype(np.int32)
-    found = jax.jit(lambda a, b: certify_rotation(a, b, np.eye(3), noise_bound=[1.0] * 6))(whole, whole + 1)
+    found = jax.jit(lambda a, b: certify_rotation(a, b, np.eye(3), noise_bound=[1.0] * 12))(whole, whole + 1)
     outside = certify_rotation(whole, whole + 1, np.eye(3), noise_bound=1.0)
     assert_allclose(found.suboptimality, outside.suboptimality, rtol=1e-5)
     assert_allclose(found.rotation, outside.rotation, atol=1e-6)
     # Truthy is used; what is claimed in float32 is rounded down.
-    masked = jax.jit(lambda a, b: certify_rotation(a, b, rotation, noise_bound=BOUND, mask=[2] * 6))(src, dst)
+    masked = with_odd_mask(src, dst, rotation, BOUND)
     best = certify_rotation(src, dst, rotation, noise_bound=BOUND)
-    assert masked.measurements == 6
+    assert masked.measurements == 12
     assert 0.99 * best.lower_bound <= masked.lower_bound <= best.cost
-    for bad in (dict(mask=[True] * 5), dict(tolerance=-1.0), dict(tolerance=np.nan)):
+    for bad in (dict(mask=[True] * 11), dict(tolerance=-1.0), dict(tolerance=np.nan)):
         with pytest.raises(ValueError, match=f"{next(iter(bad))} "):
             jax.jit(lambda a, b, bad=bad: certify_rotation(a, b, rotation, noise_bound=BOUND, **bad))(
                 src, dst
