@@ -8,7 +8,7 @@ PEERS := $(VENV)-peers/ready
 INSTALL := -m pip install --quiet --disable-pip-version-check
 # The lower bounds of pyproject.toml. Their wheels are for Python 3.11 and 3.12.
 OLDEST := jax==0.8.0 jaxlib==0.8.0 jaxtyping==0.2.34 networkx==3.0 numba==0.60.0 numpy==2.0.0 matplotlib==3.9.0 scs==3.2.7 optax==0.2.4 plotly==5.24.0 tqdm==4.66.0 trimesh==4.4.0
-TEST := -m pytest -n 2 --dist loadfile -q
+TEST := -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q
 
 # Tests, benchmarks and notebooks on real data skip where there is none.
 ifneq ($(wildcard ../shared/data),)
@@ -16,14 +16,14 @@ export TEASER_JAX_DATA ?= $(abspath ../shared/data)
 endif
 
 # Most of a test run is compilation: programs are kept beside the environment that made them.
-test slow notebooks: export JAX_COMPILATION_CACHE_DIR ?= $(abspath $(VENV))/jax-cache
-test slow notebooks: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
+test quick slow notebooks: export JAX_COMPILATION_CACHE_DIR ?= $(abspath $(VENV))/jax-cache
+test quick slow notebooks: export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.2
 
 # Two workers, each with threads of its own for small matrices, wait for one another.
-test slow: export OPENBLAS_NUM_THREADS ?= 1
+test quick slow: export OPENBLAS_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test slow lint notebooks bench studies oldest newest wheel size clean
+.PHONY: help demo test quick slow lint notebooks bench studies oldest newest wheel size clean
 
 help: ## This list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -40,6 +40,9 @@ demo: $(READY) ## Register 1000 matches of which 950 are wrong, and draw demo.pn
 
 test: $(READY) ## Run the tests, without the slow ones
 	@$(BIN)/python $(TEST)
+
+quick: $(READY) ## Run the tests that compile little: a minute, for the inner loop
+	@$(BIN)/python $(TEST) -m "not slow and not long"
 
 slow: $(READY) ## Run the slow tests
 	@$(BIN)/python $(TEST) -m slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,29 @@ import jax
 import pytest
 
 import teaser_jax as tj
+
+# Warnings are errors from the collection on: not in pyproject.toml, where a plugin of another package that
+# warns while pytest starts would stop it. Later lines win.
+WARNINGS = (
+    "error",
+    # Raised while importing or closing other people's code, which nothing here can change.
+    "ignore::DeprecationWarning:jupyter_client",
+    "ignore::DeprecationWarning:nbclient",
+    "ignore::DeprecationWarning:zmq",
+    "ignore::DeprecationWarning:(matplotlib|pyparsing)",  # 3.9 with a newer pyparsing
+    "ignore::ImportWarning:networkx",  # 3.0 without pandas
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for line in WARNINGS:
+        config.addinivalue_line("filterwarnings", line)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Workers take whole files: those with most to compile come first, so that none is left to the end."""
+    weight = Counter(item.path for item in items if item.get_closest_marker("long"))
+    items.sort(key=lambda item: -weight[item.path])  # stable: within a file nothing moves
 
 
 @pytest.fixture

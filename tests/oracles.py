@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from itertools import combinations
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -14,14 +15,46 @@ from scipy.spatial.transform import Rotation
 
 import teaser_jax as tj
 
-# Compiled once for all test files: most of a test's time is XLA's.
+# Compiled once for all test files, of one size where sizes do not matter: most of a test's time is XLA's.
 _solve = jax.jit(tj.solve)
+_solve_stack = jax.jit(jax.vmap(tj.solve))
+refit = jax.jit(tj.refit)
 DEFAULT = tj.Settings()
+STACK = 4  # problems in a stack
 
 
 def solve(problem: tj.Problem, settings: tj.Settings = DEFAULT) -> tj.Solution:
     """``tj.solve`` under jit, its answer as numpy."""
     return jax.device_get(_solve(problem, settings))
+
+
+def solve_stack(problems: tj.Problem) -> tj.Solution:
+    """``tj.solve`` under jit and vmap, its answers as numpy."""
+    return jax.device_get(_solve_stack(problems))
+
+
+def inputs_of(problem: tj.Problem) -> dict:
+    """The arrays of a problem that a pose has derivatives in."""
+    names = ("src", "dst", "noise_bound", "confidence") + (() if problem.scale is None else ("scale",))
+    return {name: getattr(problem, name) for name in names}
+
+
+def nothing_of(problem: tj.Problem) -> dict:
+    """A direction in which nothing moves."""
+    return {name: np.zeros(np.shape(x), np.asarray(x).dtype) for name, x in inputs_of(problem).items()}
+
+
+def both_ways(read, problem: tj.Problem, direction, cotangent):
+    """The derivative of a pose along a direction, forward; and the gradient of a combination, reverse."""
+    inputs = inputs_of(problem)
+    _, along = jax.linearize(lambda inputs: read(replace(problem, **inputs)).matrix, inputs)
+    return along(direction), jax.linear_transpose(along, inputs)(cotangent)[0]
+
+
+@jax.jit
+def derivatives(problem: tj.Problem, settings: tj.Settings, direction, cotangent):
+    """``both_ways`` of the pose of ``tj.solve``."""
+    return both_ways(lambda p: tj.solve(p, settings).pose, problem, direction, cotangent)
 
 
 def assert_finite(solution) -> None:

@@ -23,6 +23,12 @@ def sound(src, dst, rotation, found) -> bool:
     return true and (not found.is_optimal or verify(src, dst, rotation, found, noise_bound=BOUND))
 
 
+@jax.jit
+def with_odd_mask(src, dst, rotation, bound):
+    """A certificate of 12 measurements inside jit, all of which a mask of numbers chooses."""
+    return certify_rotation(src, dst, rotation, noise_bound=bound, mask=[2] * 12)
+
+
 def test_no_measurements():
     found = certify_rotation(np.zeros((0, 3)), np.zeros((0, 3)), np.eye(3), noise_bound=BOUND)
     assert found.status == CertificateStatus.NO_MEASUREMENTS
@@ -145,6 +151,7 @@ def test_what_is_no_rotation_is_projected(make):
     assert not (found.is_optimal and found.cost > best_rotation(src, dst)[1] * 1.001 + 1e-6)
 
 
+@pytest.mark.long
 def test_not_a_number_anywhere():
     src, dst, rotation = draw_vectors(7, 12, 0.0)
     odd = dst.copy()
@@ -155,9 +162,8 @@ def test_not_a_number_anywhere():
     assert found.is_optimal
     assert found.measurements == 11
     # Inside jit nothing can be raised: nothing is claimed instead.
-    jitted = jax.jit(lambda r, bound: certify_rotation(src, dst, r, noise_bound=bound))
     for r, bound in ((np.full((3, 3), np.nan), BOUND), (best, np.nan), (best, 0.0), (best, -1.0)):
-        inside = jitted(r, bound)
+        inside = with_odd_mask(src, dst, r, bound)
         known = rotation_cost(src, dst, best)
         assert not bool(inside.is_optimal) or (bound == BOUND and float(inside.cost) <= 1.001 * known)
 
@@ -194,19 +200,19 @@ def test_more_than_it_can_look_at():
     assert found.lower_bound == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("unused", ["zero", "nan", "masked"])
 @pytest.mark.parametrize("method", ["direct", "splitting", "reference"])
 def test_unused_rows_may_stand_anywhere(unused, method):
     # Once padding was looked for at the end only, and the bound of a wrong candidate lay above the optimum.
+    known = dict(noise_bound=BOUND, method=method, iterations=5)
+    inside = jax.jit(lambda a, b, r, m: certify_rotation(a, b, r, mask=m, **known))
     for seed in range(4):
         src, dst, truth = draw_vectors([17, seed], 12, 0.3)
         candidate, mask = turned(truth, 120, seed), np.ones(12, bool)
-        known = dict(noise_bound=BOUND, method=method, iterations=5)
         if unused == "masked":
             mask[:4] = False
-            found = jax.jit(lambda a, b, r, m, k=known: certify_rotation(a, b, r, mask=m, **k))(
-                src, dst, candidate, mask
-            )
+            found = inside(src, dst, candidate, mask)
         else:
             src[:4] = 0.0 if unused == "zero" else np.nan
             found = certify_rotation(src, dst, candidate, **known)
@@ -217,19 +223,20 @@ def test_unused_rows_may_stand_anywhere(unused, method):
         assert_allclose(float(found.lower_bound) - resting, last.lower_bound, atol=2e-2)
 
 
+@pytest.mark.long
 def test_numbers_of_all_kinds_under_jit():
-    src, dst, rotation = draw_vectors(0, 6, 0.0)
+    src, dst, rotation = draw_vectors(0, 12, 0.0)
     whole = np.round(src * 20).astype(np.int32)
-    found = jax.jit(lambda a, b: certify_rotation(a, b, np.eye(3), noise_bound=[1.0] * 6))(whole, whole + 1)
+    found = jax.jit(lambda a, b: certify_rotation(a, b, np.eye(3), noise_bound=[1.0] * 12))(whole, whole + 1)
     outside = certify_rotation(whole, whole + 1, np.eye(3), noise_bound=1.0)
     assert_allclose(found.suboptimality, outside.suboptimality, rtol=1e-5)
     assert_allclose(found.rotation, outside.rotation, atol=1e-6)
     # Truthy is used; what is claimed in float32 is rounded down.
-    masked = jax.jit(lambda a, b: certify_rotation(a, b, rotation, noise_bound=BOUND, mask=[2] * 6))(src, dst)
+    masked = with_odd_mask(src, dst, rotation, BOUND)
     best = certify_rotation(src, dst, rotation, noise_bound=BOUND)
-    assert masked.measurements == 6
+    assert masked.measurements == 12
     assert 0.99 * best.lower_bound <= masked.lower_bound <= best.cost
-    for bad in (dict(mask=[True] * 5), dict(tolerance=-1.0), dict(tolerance=np.nan)):
+    for bad in (dict(mask=[True] * 11), dict(tolerance=-1.0), dict(tolerance=np.nan)):
         with pytest.raises(ValueError, match=f"{next(iter(bad))} "):
             jax.jit(lambda a, b, bad=bad: certify_rotation(a, b, rotation, noise_bound=BOUND, **bad))(
                 src, dst

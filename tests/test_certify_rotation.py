@@ -160,6 +160,7 @@ def test_units_do_not_matter():
     assert thousands.is_optimal == ones.is_optimal
 
 
+@pytest.mark.long
 def test_padding_and_masks_change_nothing():
     src, dst, rotation = draw_vectors(5, 21, 0.2)
     found = certify_rotation(src, dst, rotation, noise_bound=BOUND)
@@ -174,6 +175,7 @@ def test_padding_and_masks_change_nothing():
     assert_allclose(masked.dual.skew[:22, :22], found.dual.skew[:22, :22], atol=1e-9)
 
 
+@pytest.mark.long
 def test_under_jit_and_vmap_it_says_the_same():
     src, dst, rotation = draw_vectors(6, 16, 0.2)
     rotation = certify_rotation(src, dst, rotation, noise_bound=BOUND).rotation
@@ -214,6 +216,7 @@ def test_bad_input_is_refused(change, words):
         certify_rotation(**known)
 
 
+@pytest.mark.long
 def test_a_stack_says_what_its_items_say():
     drawn = [draw_vectors(seed, k, 0.3) for seed, k in enumerate((12, 12, 20, 20))]
     src, dst = np.zeros((4, 20, 3)), np.zeros((4, 20, 3))
@@ -238,6 +241,7 @@ def test_a_stack_says_what_its_items_say():
         jax.jit(lambda a: certify_rotation(a, dst, np.eye(3), noise_bound=BOUND))(src)
 
 
+@pytest.mark.long
 def test_the_work_of_many_measurements_is_bounded():
     # Where iterations cannot be afforded the direct test still is.
     src, dst, rotation = draw_vectors(0, 250, 0.0)
@@ -247,6 +251,7 @@ def test_the_work_of_many_measurements_is_bounded():
     assert found.iterations == 0
 
 
+@pytest.mark.long
 def test_concrete_numbers_inside_somebody_elses_jit():
     src, dst, rotation = draw_vectors(0, 12, 0.0)
     outside = certify_rotation(src, dst, rotation, noise_bound=BOUND)
@@ -258,6 +263,7 @@ def test_concrete_numbers_inside_somebody_elses_jit():
     assert_allclose(inside(1.0), 1 + outside.cost, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_the_reference_method_proves_the_same():
     src, dst, rotation = draw_vectors(1, 10, 0.2)
     best = certify_rotation(src, dst, rotation, noise_bound=BOUND).rotation

@@ -107,6 +107,7 @@ def test_options_win_over_the_file_and_the_file_over_the_defaults(
     assert received == [{"noise_bound": 1}, {"noise_bound": 1, name: 2}, {"noise_bound": 1, name: 3}]
 
 
+@pytest.mark.long
 def test_an_estimated_scale(tmp_path, capsys):
     problem = tj.synthetic.random_problem(1, n=32, outlier_rate=0.25, scale=3.0)
     path = tmp_path / "m.npz"
@@ -315,6 +316,7 @@ def test_as_a_program(tmp_path):
     assert "is no .npz archive" in done.stderr
 
 
+@pytest.mark.long
 def test_a_real_pair(data_dir, capsys):
     path = data_dir / "kitti_fpfh" / "080.npz"
     if not path.exists():

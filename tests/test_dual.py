@@ -59,6 +59,7 @@ def test_golden_matrices(golden, x64):
     assert_allclose(first + moved, golden["M_affine_1st_iter"], atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["certification_small_1", "certification_small_2", "certification_large_1"])
 def test_golden_trajectories(name, data_dir, x64):
     z = np.load(data_dir / "teaser_fixtures" / f"{name}.npz")

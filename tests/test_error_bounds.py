@@ -33,6 +33,7 @@ def check(drawn, result, bounds):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1.0, None])
 @pytest.mark.parametrize(("n", "rate"), [(50, 0.3), (100, 0.5), (100, 0.8)])
 def test_the_truth_lies_within_the_bound_over_the_whole_set(n, rate, scale):
@@ -117,6 +118,7 @@ def test_the_flattest_four_is_exact():
     assert flattest_four(np.zeros((4, 3))) == 0
 
 
+@pytest.mark.long
 def test_the_bounds_of_the_paper_and_their_reasons():
     _, result = registered(0, 100, 0.5)
     bounds = tj.error_bounds(result.problem, result.solution)

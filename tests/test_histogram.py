@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -27,9 +28,6 @@ def few_bins(request, monkeypatch):
     passes = math.ceil(math.log(1e8, bins))  # as sharp an eye as the many bins give
     monkeypatch.setattr(histogram, "SAMPLE_PASSES", passes)
     monkeypatch.setattr(histogram, "most_ends", lambda count: ends)
-    by_histogram.clear_cache()
-    yield
-    by_histogram.clear_cache()
 
 
 class Listed:
@@ -48,8 +46,12 @@ class Listed:
         return [x[k, i] for x in self.columns]
 
 
-@jax.jit
-def by_histogram(values, bounds, mask, cbar2, interval):
+def by_histogram(*args):
+    return compiled_histogram(*args, bins=histogram.BINS)
+
+
+@partial(jax.jit, static_argnames="bins")  # what the fixture changes is read when this is traced
+def compiled_histogram(values, bounds, mask, cbar2, interval, *, bins):
     unit = jnp.asarray(1.5, values.dtype)
     return vote_by_histogram(Listed(values, bounds, mask), cbar2=cbar2, unit=unit, interval=interval)
 
@@ -173,20 +175,23 @@ def test_a_batch_equals_a_loop(few_bins):
             assert batched[1][i] == witness
 
 
+@partial(jax.jit, static_argnames="method")  # which is chosen when this is traced
+def compiled_scale(src, dst, noise_bound, *, method):
+    one = jnp.ones((), src.dtype)
+    return scale.estimate_scale(src, dst, noise_bound, np.ones(len(src), bool), cbar2=one)
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("n", [40, 41])
 def test_the_scale_of_all_pairs_is_that_of_the_sweep(few_bins, monkeypatch, dtype, n):
     matches = random_matches(3, n, wrong=0.5, scale=1.7)
     args = [np.asarray(x, dtype) for x in (matches.src, matches.dst, np.full(n, matches.noise_bound))]
 
-    def estimated():
-        one = jnp.ones((), dtype)
-        return jax.jit(lambda *x: scale.estimate_scale(*x, np.ones(n, bool), cbar2=one))(*args)
-
     monkeypatch.setattr(scale, "FEW_PAIRS", 0)
-    found, pairs = estimated()
+    found, pairs = compiled_scale(*args, method=f"{histogram.BINS} bins")
     monkeypatch.setattr(scale, "FEW_PAIRS", n * n)
-    swept, agreeing = estimated()
+    swept, agreeing = compiled_scale(*args, method="sweep")
     np.testing.assert_array_equal(unpack(pairs, n), unpack(agreeing, n))
     assert float(found) == float(swept)
     assert found.dtype == dtype

@@ -12,6 +12,9 @@ from oracles import random_pose
 import teaser_jax as tj
 from teaser_jax import learn
 
+# Step by step each loss compiles dozens of programs.
+matching_loss = jax.jit(learn.matching_loss)
+
 
 def pose(seed: int) -> tj.Pose:
     return jax.tree.map(jnp.asarray, random_pose(np.random.default_rng(seed)))
@@ -34,10 +37,9 @@ def test_pose_losses_take_batches(x64):
     several, others = stack(pose(0), pose(1)), stack(pose(2), pose(3))
     points = np.random.default_rng(0).normal(size=(2, 5, 3))
     for loss in (learn.rotation_loss, learn.translation_loss, lambda a, b: learn.point_loss(a, b, points)):
-        assert loss(several, others).shape == (2,)
-    np.testing.assert_allclose(
-        learn.rotation_loss(several, others)[1], learn.rotation_loss(pose(1), pose(3)), rtol=1e-12
-    )
+        assert jax.eval_shape(loss, several, others).shape == (2,)
+    rotation_loss = jax.jit(learn.rotation_loss)
+    np.testing.assert_allclose(rotation_loss(several, others)[1], rotation_loss(pose(1), pose(3)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi])
@@ -52,7 +54,7 @@ def test_gradients_are_finite_at_every_angle(angle, x64):
         total = learn.rotation_loss(estimate, truth) + learn.translation_loss(estimate, truth)
         return total + learn.point_loss(estimate, truth, points)
 
-    value, slope = jax.value_and_grad(loss)(truth.rotation @ turn)
+    value, slope = jax.jit(jax.value_and_grad(loss))(truth.rotation @ turn)
     assert np.isfinite(value)
     assert np.all(np.isfinite(slope))
 
@@ -77,7 +79,7 @@ def test_keypoint_loss_saturates_and_draws_keypoints_together(x64):
     assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1, mask=np.arange(8) > 0) < 1e-20
     off = src + 0.05
     loss = lambda src: learn.keypoint_loss(src, dst, truth, noise_bound=0.1)
-    assert loss(off - 0.01 * jax.grad(loss)(jnp.asarray(off))) < loss(off)
+    assert loss(off - 0.01 * jax.jit(jax.grad(loss))(jnp.asarray(off))) < loss(off)
 
 
 def test_matching_loss_by_hand(x64):
@@ -87,7 +89,7 @@ def test_matching_loss_by_hand(x64):
     dst = np.concatenate([np.asarray(truth.apply(src[:4])), rng.uniform(5, 6, (3, 3))])
     a, b = rng.normal(size=(6, 4)), rng.normal(size=(7, 4))
     a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b))
-    found = learn.matching_loss(a, b, src, dst, truth, radius=1e-3, temperature=0.5)
+    found = matching_loss(a, b, src, dst, truth, radius=1e-3, temperature=0.5)
     weight = np.exp(a @ b.T / 0.5)
     rows = np.mean([-np.log(weight[i, i] / weight[i].sum()) for i in range(4)])
     columns = np.mean([-np.log(weight[i, i] / weight[:, i].sum()) for i in range(4)])
@@ -104,7 +106,7 @@ def test_nothing_to_learn_from_is_zero_with_gradient_zero():
         lambda a: learn.point_loss(truth, pose(7), a[:, :3], nothing),
     ]
     for loss in losses:
-        value, slope = jax.value_and_grad(loss)(a)
+        value, slope = jax.jit(jax.value_and_grad(loss))(a)
         assert value == 0
         np.testing.assert_array_equal(slope, 0)
 
@@ -112,6 +114,13 @@ def test_nothing_to_learn_from_is_zero_with_gradient_zero():
 def unit_rows(seed: int, n: int = 10) -> np.ndarray:
     rows = np.random.default_rng(seed).normal(size=(n, 8)).astype(np.float32)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+@jax.jit
+def contrastive(a, b, points, pose, temperature):
+    """The loss and its gradient in the first descriptors."""
+    loss = lambda x: learn.matching_loss(x, b, points, points, pose, radius=1e-3, temperature=temperature)
+    return jax.value_and_grad(loss)(a)
 
 
 @pytest.mark.parametrize("temperature", [0.1, 0.01, 0.001])
@@ -122,9 +131,9 @@ def test_the_contrastive_loss_is_exact_at_every_temperature(temperature):
     scores = (a.astype(float) @ b.astype(float).T) / temperature
     total = lambda axis: scores.max(axis) + np.log(np.exp(scores - scores.max(axis, keepdims=True)).sum(axis))
     both = [np.mean(total(axis) - np.diagonal(scores)) for axis in (0, 1)]
-    loss = lambda x: learn.matching_loss(x, b, points, points, one, radius=1e-3, temperature=temperature)
-    assert loss(a) == pytest.approx(np.mean(both), rel=1e-4)
-    assert np.isfinite(jax.grad(loss)(a)).all()
+    loss, slope = contrastive(a, b, points, one, temperature)
+    assert loss == pytest.approx(np.mean(both), rel=1e-4)
+    assert np.isfinite(slope).all()
 
 
 def test_points_that_are_masked_or_no_numbers_do_not_count():
@@ -133,7 +142,7 @@ def test_points_that_are_masked_or_no_numbers_do_not_count():
     a, b = unit_rows(0), unit_rows(1)
     broken, odd, some = points.copy(), a.copy(), np.arange(10) > 0
     broken[0], odd[0] = np.nan, np.inf
-    loss = lambda x, src, **known: learn.matching_loss(x, b, src, points, one, radius=0.01, **known)
+    loss = lambda x, src, **known: matching_loss(x, b, src, points, one, radius=0.01, **known)
     expected = loss(a, points, src_mask=some)
     assert expected > 0
     assert loss(a, broken, src_mask=some) == expected
@@ -160,7 +169,7 @@ def test_keypoints_of_every_type_and_distance(kind, far):
     loss = lambda dst: learn.keypoint_loss(src, dst, one, noise_bound=0.5)
     dst = src + np.asarray(far, kind)
     assert loss(dst) == pytest.approx(3 * far**2 / (0.25 + 3 * far**2), rel=1e-3)
-    assert np.isfinite(jax.grad(loss)(dst.astype(np.float32))).all()
+    assert np.isfinite(jax.jit(jax.grad(loss))(dst.astype(np.float32))).all()
 
 
 def test_impossible_numbers_are_refused():

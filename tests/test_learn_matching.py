@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from teaser_jax.learn import match, soft_counterparts
+from teaser_jax import learn
+from teaser_jax.learn import soft_counterparts
+
+match = partial(jax.jit, static_argnames="mutual")(learn.match)  # step by step it compiles a hundred programs
+counterparts = jax.jit(soft_counterparts)
 
 
 def descriptors(seed: int, n: int, m: int, d: int = 8) -> tuple[np.ndarray, np.ndarray]:
@@ -55,7 +61,7 @@ def test_confidences_have_an_exact_gradient(x64):
     a, b = descriptors(3, 6, 8)
     direction = np.random.default_rng(0).normal(size=a.shape)
     confidence = lambda a: match(a, jnp.asarray(b), temperature=0.7).confidence
-    _, forward = jax.jvp(confidence, (jnp.asarray(a),), (jnp.asarray(direction),))
+    _, forward = jax.jit(lambda a, d: jax.jvp(confidence, (a,), (d,)))(jnp.asarray(a), jnp.asarray(direction))
     central = (confidence(a + 1e-6 * direction) - confidence(a - 1e-6 * direction)) / 2e-6
     np.testing.assert_allclose(forward, central, atol=1e-8)
     assert np.max(np.abs(forward)) > 1e-3
@@ -64,14 +70,14 @@ def test_confidences_have_an_exact_gradient(x64):
 def test_a_cold_softmax_is_the_hard_choice_and_a_warm_one_has_a_gradient(x64):
     a, b = descriptors(4, 6, 8)
     dst = np.random.default_rng(0).normal(size=(8, 3))
-    cold = soft_counterparts(a, b, dst, temperature=1e-3)
+    cold = counterparts(a, b, dst, temperature=1e-3)
     np.testing.assert_allclose(cold, dst[match(a, b).counterpart], atol=1e-9)
     kept = np.arange(8) < 5
     np.testing.assert_allclose(
-        soft_counterparts(a, b, dst, dst_mask=kept), soft_counterparts(a, b[:5], dst[:5]), atol=1e-12
+        counterparts(a, b, dst, dst_mask=kept), counterparts(a, b[:5], dst[:5]), atol=1e-12
     )
     total = lambda a: jnp.sum(soft_counterparts(a, b, dst, temperature=1.0) ** 2)
-    assert np.all(np.abs(jax.grad(total)(jnp.asarray(a))) > 0)
+    assert np.all(np.abs(jax.jit(jax.grad(total))(jnp.asarray(a))) > 0)
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e30])
@@ -87,14 +93,14 @@ def test_descriptors_that_are_not_finite_match_nothing_and_spoil_no_gradient(x64
     found = match(a, b, mutual=False)
     assert not found.mask[1]
     assert not np.any(found.counterpart[found.mask] == 2)
-    slope = jax.grad(lambda a: jnp.sum(match(a, jnp.asarray(b)).confidence))(jnp.asarray(a))
+    slope = jax.jit(jax.grad(lambda a: jnp.sum(match(a, jnp.asarray(b)).confidence)))(jnp.asarray(a))
     assert np.all(np.isfinite(slope))
 
 
 def test_nonsense_is_refused():
     a, b = (jnp.asarray(x) for x in descriptors(7, 6, 8))
-    for bad in (lambda: match(a, b[:, :3]), lambda: match(a, b[:0]), lambda: match(a[None], b[None])):
+    for bad in ((a, b[:, :3]), (a, b[:0]), (a[None], b[None])):
         with pytest.raises(ValueError, match="expected"):
-            bad()
+            learn.match(*bad)
     with pytest.raises(ValueError, match="temperature"):
-        match(a, b, temperature=-1.0)
+        learn.match(a, b, temperature=-1.0)

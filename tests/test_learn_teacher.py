@@ -27,6 +27,7 @@ def batch_of(*wrong: float) -> tuple[np.ndarray, np.ndarray, list]:
     return np.stack([d.src for d in drawn]), np.stack([d.dst for d in drawn]), drawn
 
 
+@pytest.mark.long
 def test_right_labels_are_trusted_and_hopeless_ones_are_not(x64):
     src, dst, drawn = batch_of(0.3, 0.5, 1.0)
     labels = taught(src, dst)
@@ -38,6 +39,7 @@ def test_right_labels_are_trusted_and_hopeless_ones_are_not(x64):
     assert labels.status[2] != tj.Status.OK
 
 
+@pytest.mark.long
 def test_axes_masks_and_thresholds(x64):
     src, dst, drawn = batch_of(0.3, 0.5, 1.0)
     several = taught(np.stack([src, src]), np.stack([dst, dst]))
@@ -50,6 +52,7 @@ def test_axes_masks_and_thresholds(x64):
     np.testing.assert_array_equal(taught(src, dst, least_inliers=few + 1).trusted, [True, False, False])
 
 
+@pytest.mark.long
 def test_no_gradient_flows_into_labels(x64):
     src, dst, _ = batch_of(0.3, 0.5, 1.0)
     slope = jax.jit(jax.grad(lambda dst: jnp.sum(teacher(src, dst, noise_bound=0.05).pose.matrix)))(dst)

@@ -32,6 +32,7 @@ SLOW = ("03_certificates", "04_learning_through_registration", "05_batches_and_d
 LONG = [pytest.param(p, marks=pytest.mark.slow) if p.stem in SLOW else p for p in NOTEBOOKS]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", LONG, ids=lambda path: path.stem)
 def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in surroundings(tmp_path).items():

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from oracles import solve
 
 import teaser_jax as tj
 from teaser_jax.engine.packing import pack, pack_problem, unpack, unpack_problem, unpack_settings
@@ -23,13 +24,14 @@ CASES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_nothing_is_lost(case, x64):
     known = dict(CASES[case])
     settings = known.pop("settings", tj.Settings())
     drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
     problem = tj.make_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, **known)
-    solution = jax.jit(tj.solve)(problem, settings)
+    solution = solve(problem, settings)
     found = unpack(jax.device_get(jax.jit(pack)(solution)))
     for before, after in zip(jax.tree.leaves(solution), jax.tree.leaves(found), strict=True):
         assert before.dtype == after.dtype

@@ -22,6 +22,7 @@ def framed(src, dst, rotation=None) -> Measurements:
     return Measurements(jnp.asarray(src / BOUND), jnp.asarray(dst / BOUND @ rotation), jnp.asarray(1.0), ones)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [0.0, 0.5, 0.8, 1.0])
 def test_it_finds_what_trying_all_pairs_and_triples_finds(wrong, x64):
     for seed in range(3):
@@ -30,6 +31,7 @@ def test_it_finds_what_trying_all_pairs_and_triples_finds(wrong, x64):
         assert rotation_cost(src, dst, np.asarray(found_by(framed(src, dst)))) <= least + 1e-9
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("k", "wrong"), [(40, 0.8), (40, 0.9), (100, 0.8), (100, 0.9)])
 def test_it_is_never_worse_than_gnc_or_the_truth_at_high_rates(k, wrong):
     for seed in range(5):
@@ -73,6 +75,7 @@ def test_masked_and_many_measurements(x64, monkeypatch):
     assert jax.jit(lambda m: search_pairs(m))(m).shape == (3, 3)
 
 
+@pytest.mark.long
 def test_in_the_cascade_it_changes_nothing_that_is_right(small):
     problem = small
     for graph in ("chain", "complete"):
@@ -87,6 +90,7 @@ def test_in_the_cascade_it_changes_nothing_that_is_right(small):
         assert results[1].ok
 
 
+@pytest.mark.long
 def test_in_float32_and_under_vmap(small):
     problem = tj.make_problem(small.src, small.dst, noise_bound=small.noise_bound)
     settings = tj.Settings(rotation="global", clique="greedy")

@@ -9,6 +9,7 @@ from dataclasses import replace
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.collections import PathCollection
 
 import teaser_jax as tj
 from teaser_jax import plots
@@ -63,8 +64,18 @@ def test_the_picture_does_not_depend_on_where_the_clouds_are(small, solved):
 def test_hardly_any_finite_rows(small, solved, rows):
     src = small.src.copy()
     src[rows:] = np.nan
-    figure = plots.plot_registration(src, small.dst, solved)
-    figure.savefig(io.BytesIO(), format="png", dpi=40)
+    before, after = plots.plot_registration(src, small.dst, solved).axes
+    right = int(solved.inliers[:rows].sum())
+    assert before.get_title() == f"Before: {rows} matches"
+    assert after.get_title() == f"After: {right} {'inlier' if right == 1 else 'inliers'}, OK"
+    # Both clouds and the inliers: nothing but the finite rows, in a window of some size.
+    for axes in (before, after):
+        clouds = [np.asarray(x.get_offsets()) for x in axes.collections if isinstance(x, PathCollection)]
+        assert [len(points) for points in clouds] == [rows, rows, right]
+        assert all(np.isfinite(points).all() for points in clouds)
+        for low, high in (axes.get_xlim(), axes.get_ylim()):
+            assert -np.inf < low < high < np.inf
+    drawn(before.figure)
 
 
 def test_every_stage(small, solved):

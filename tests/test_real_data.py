@@ -11,6 +11,7 @@ import teaser_jax as tj
 ACCEPTED = {"kitti_fpfh": (0.6, 5.0, 0.6), "eth_tls": (0.1, 5.0, 0.5), "threedmatch": (0.05, 10.0, 0.3)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ACCEPTED)
 def test_every_real_pair_is_right_and_ok(data_dir, folder):
     bound, rotation_limit, translation_limit = ACCEPTED[folder]
@@ -26,6 +27,7 @@ def test_every_real_pair_is_right_and_ok(data_dir, folder):
         assert tj.metrics.translation_error(result.pose, truth) < translation_limit, path.name
 
 
+@pytest.mark.long
 def test_a_source_with_another_pairs_target_is_not_ok(data_dir):
     pairs = [np.load(path) for path in sorted((data_dir / "kitti_fpfh").glob("*.npz"))]
     for a, b in zip(pairs, pairs[1:] + pairs[:1], strict=True):
@@ -34,6 +36,7 @@ def test_a_source_with_another_pairs_target_is_not_ok(data_dir):
         assert result.status == tj.Status.NO_CONSENSUS or result.status == tj.Status.DEGENERATE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["kitti_fpfh", "eth_tls"])  # the wall of 3DMatch fits both ways
 @pytest.mark.parametrize("axis", range(3))
 def test_a_mirrored_target_is_not_ok(data_dir, folder, axis):
@@ -45,6 +48,7 @@ def test_a_mirrored_target_is_not_ok(data_dir, folder, axis):
         assert result.status == tj.Status.NO_CONSENSUS, path.name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [1, 3, 5])
 def test_golden_problems_with_unknown_scale(data_dir, number):
     """TEASER++'s test problems (10, 10 and 100 points; 0, 30 and 90 % wrong), free of noise.

@@ -20,7 +20,8 @@ from teaser_jax.stages.rotation.relaxation import MAX_RELAXED, relax
 pytest.importorskip("scs")
 
 
-@pytest.mark.parametrize(("k", "wrong"), [(6, 0.0), (8, 0.25), (10, 0.5)])
+@pytest.mark.long
+@pytest.mark.parametrize(("k", "wrong"), [(8, 0.0), (8, 0.25), (10, 0.5)])
 def test_it_is_tight_and_agrees_with_the_other_methods(k, wrong):
     src, dst, _ = draw_vectors((k, 1), k, wrong)
     found = tj.solve_rotation(src, dst, noise_bound=BOUND, method="sdp")
@@ -36,6 +37,7 @@ def test_it_is_tight_and_agrees_with_the_other_methods(k, wrong):
     assert tj.verify(src, dst, found.rotation, found.certificate, noise_bound=BOUND)
 
 
+@pytest.mark.long
 def test_it_finds_the_rotation_from_a_wrong_start(x64):
     # GNC fails here, so rank one of the relaxation is not the merit of its start.
     src, dst, truth = draw_vectors(5, 10, 0.5)
@@ -46,6 +48,7 @@ def test_it_finds_the_rotation_from_a_wrong_start(x64):
     assert rotation_cost(src, dst, best.turn) == pytest.approx(best_rotation(src, dst)[1], rel=1e-6)
 
 
+@pytest.mark.long
 def test_its_value_is_a_lower_bound_where_it_is_not_tight():
     # All wrong: the optimum fits one or two by chance, and the relaxation may lie below it.
     src, dst, _ = draw_vectors(0, 8, 1.0)
@@ -69,6 +72,7 @@ def test_constraints_of_the_relaxation_hold(x64):
     assert np.linalg.eigvalsh(found.matrix)[0] > -1e-6
 
 
+@pytest.mark.long
 def test_a_dual_in_another_frame_proves_the_same(x64):
     src, dst, truth = draw_vectors(3, 6, 0.4)
     rng = np.random.default_rng(0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from oracles import assert_finite, problem_of, random_matches, solve
+from oracles import assert_finite, derivatives, nothing_of, problem_of, random_matches, solve
 
 import teaser_jax as tj
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
@@ -48,6 +48,22 @@ def both_ways(problem, gnc_mu, direction, cotangent):
     return along(direction), jax.linear_transpose(along, inputs)(cotangent)[0]
 
 
+NAMES = ("src", "dst", "noise_bound", "confidence", "cbar2")
+
+
+def inputs_and(problem, gnc_mu) -> dict:
+    """Everything that the pose and the weights have derivatives in."""
+    names = [*NAMES] + ["scale"] * (problem.scale is not None)
+    return {**{name: getattr(problem, name) for name in names}, "gnc_mu": jnp.asarray(gnc_mu)}
+
+
+def slope_of_pose(problem, cotangent) -> np.ndarray:
+    """The gradient, in the targets, of a combination of the pose's numbers."""
+    still = jax.tree.map(jnp.zeros_like, inputs_and(problem, 1.0))
+    return both_ways(problem, 1.0, still, (cotangent, np.zeros(N)))[1]["dst"]
+
+
+@pytest.mark.long
 @pytest.mark.parametrize(
     "scale", [pytest.param(1.3, id="known"), pytest.param(None, id="unknown", marks=pytest.mark.slow)]
 )
@@ -57,8 +73,7 @@ def test_forward_reverse_and_central_differences_agree(scale, x64):
     found = soften(problem, mu)
     assert found.ok
     assert np.sum((found.weights > 0.01) & (found.weights < 0.99)) >= 3
-    names = ["src", "dst", "noise_bound", "confidence", "cbar2"] + ["scale"] * (scale is not None)
-    inputs = {**{name: getattr(problem, name) for name in names}, "gnc_mu": jnp.asarray(mu)}
+    inputs = inputs_and(problem, mu)
     cotangent = rng.normal(size=(4, 4)), rng.normal(size=N)
     for name, value in inputs.items():
         direction = {key: jnp.zeros_like(x) for key, x in inputs.items()}
@@ -76,6 +91,7 @@ def test_forward_reverse_and_central_differences_agree(scale, x64):
         np.testing.assert_allclose(np.sum(gradient[name] * direction[name]), combined, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.long
 def test_unrolling_the_iteration_gives_the_same_gradient(x64):
     problem = blurred(12, scale=1.3)
     start = soften(problem, 1.0).pose
@@ -89,29 +105,28 @@ def test_unrolling_the_iteration_gives_the_same_gradient(x64):
 
         return jnp.sum(cotangent * lax.fori_loop(0, 60, step, start).matrix)
 
-    implicit = jax.jit(jax.grad(lambda dst: jnp.sum(cotangent * _pose(replace(problem, dst=dst)).matrix)))
-    np.testing.assert_allclose(implicit(problem.dst), jax.jit(jax.grad(unrolled))(problem.dst), atol=1e-8)
+    implicit = slope_of_pose(problem, cotangent)
+    np.testing.assert_allclose(implicit, jax.jit(jax.grad(unrolled))(problem.dst), atol=1e-8)
 
 
 def _pose(problem: tj.Problem) -> tj.Pose:
     return tj.soft_solve(problem).pose
 
 
+@pytest.mark.long
 def test_matches_near_the_threshold_have_a_gradient_that_solve_lacks(x64):
     problem = blurred(11, scale=1.3)
     found = soften(problem, 1.0)
     half = (found.weights > 0.05) & (found.weights < 0.95)
     out = half & ~found.solution.inliers
     assert out.any()
-
-    def slope(pose_of):
-        total = lambda dst: jnp.sum(pose_of(replace(problem, dst=dst)).matrix)
-        return np.linalg.norm(jax.jit(jax.grad(total))(problem.dst), axis=1)
-
-    assert np.all(slope(_pose)[out] > 1e-6)
-    np.testing.assert_array_equal(slope(lambda p: tj.solve(p).pose)[out], 0)
+    soft = slope_of_pose(problem, np.ones((4, 4)))
+    _, hard = derivatives(problem, tj.Settings(), nothing_of(problem), np.ones((4, 4)))
+    assert np.all(np.linalg.norm(soft, axis=1)[out] > 1e-6)
+    np.testing.assert_array_equal(hard["dst"][out], 0)
 
 
+@pytest.mark.long
 def test_a_stiff_control_gives_the_answer_of_solve(x64):
     problem = problem_of(random_matches(13, N, wrong=0.4), scale=None)
     stiff = soften(problem, 1e6)
@@ -120,6 +135,7 @@ def test_a_stiff_control_gives_the_answer_of_solve(x64):
     assert stiff.cost == pytest.approx(float(stiff.solution.cost), rel=1e-6)
 
 
+@pytest.mark.long
 def test_the_cost_is_stationary_and_least(x64):
     problem = blurred(14, scale=None)
     found = soften(problem, 1.0)
@@ -145,6 +161,7 @@ def test_weights_are_the_slope_of_the_cost(x64):
         assert np.all(np.isfinite(jax.vmap(jax.grad(gnc_weights), (0, None, None))(r2, mu, 1.0)))
 
 
+@pytest.mark.long
 def test_hopeless_items_are_finite_say_so_and_spoil_none(x64):
     good = blurred(15, scale=None)
     line = np.zeros((N, 3))
@@ -174,6 +191,7 @@ def test_hopeless_items_are_finite_say_so_and_spoil_none(x64):
     np.testing.assert_array_equal(slopes[1][1:5], 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mu", [0.0, -1.0, np.nan, np.inf])
 def test_a_control_that_makes_no_sense_is_no_success(mu, x64):
     found = soften(blurred(11), mu)
@@ -191,6 +209,7 @@ def test_impossible_controls_are_refused_outside_jit():
             tj.soft_solve(problem, iterations=iterations)
 
 
+@pytest.mark.long
 def test_a_wrong_match_may_be_as_far_away_as_it_likes():
     """The middle about which poses vary took part in wrong matches: DEGENERATE, where ``solve`` is OK."""
     drawn = tj.synthetic.random_problem(0, n=100, outlier_rate=0.5)

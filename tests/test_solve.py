@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax import lax
 from oracles import (
+    STACK,
     Matches,
     assert_finite,
     joint_residuals,
@@ -17,15 +18,15 @@ from oracles import (
     problem_of,
     random_matches,
     random_pose,
+    refit,
     solve,
+    solve_stack,
 )
 
 import teaser_jax as tj
 from teaser_jax.problem import pad_problem
 
 N = 32
-refit = jax.jit(tj.refit)
-_solve_batch = jax.jit(jax.vmap(tj.solve))
 
 VARIANTS = {
     "default": tj.Settings(),
@@ -39,10 +40,6 @@ both_scales = pytest.mark.parametrize("scale", [1.3, None], ids=["known", "unkno
 
 def matches_of(seed: int, n: int = N, *, wrong: float = 0.4, noise: float = 1.0) -> Matches:
     return random_matches(seed, n, wrong=wrong, noise=noise, scale=1.3)
-
-
-def solve_batch(problems: tj.Problem) -> tj.Solution:
-    return jax.device_get(_solve_batch(problems))
 
 
 def item(batch, index: int):
@@ -79,17 +76,19 @@ def test_right_matches_are_found(scale, x64):
         assert bool(solution.selection.refined)
 
 
+@pytest.mark.long
 def test_a_batch_equals_a_loop(x64):
-    problems = [problem_of(matches_of(seed), scale=None) for seed in range(4)]
-    batch = solve_batch(tj.stack_problems(problems))
+    problems = [problem_of(matches_of(seed), scale=None) for seed in range(STACK)]
+    batch = solve_stack(tj.stack_problems(problems))
     for k, problem in enumerate(problems):
         assert_same(item(batch, k), solve(problem))
 
 
+@pytest.mark.long
 def test_padding_changes_nothing(x64):
     short = [problem_of(matches_of(seed, 20), scale=None) for seed in range(3)]
     alone = [solve(problem) for problem in short]
-    batch = solve_batch(tj.stack_problems([*short, problem_of(matches_of(3), scale=None)]))
+    batch = solve_stack(tj.stack_problems([*short, problem_of(matches_of(3), scale=None)]))
     for k, problem in enumerate(short):
         for padded in (item(batch, k), solve(pad_problem(problem, N))):
             assert_same(padded, alone[k], rows=20)
@@ -97,6 +96,7 @@ def test_padding_changes_nothing(x64):
             assert not np.any(padded.selection.clique[20:])
 
 
+@pytest.mark.long
 def test_inside_scan(x64):
     problems = tj.stack_problems([problem_of(matches_of(seed)) for seed in range(4)])
     along = jax.jit(lambda x: lax.scan(lambda carry, problem: (carry, tj.solve(problem)), 0, x)[1])(problems)
@@ -104,6 +104,7 @@ def test_inside_scan(x64):
         assert_same(item(along, k), solve(item(problems, k)))
 
 
+@pytest.mark.long
 @both_scales
 def test_the_pose_is_the_read_out_of_the_selection(scale, x64):
     problem = problem_of(matches_of(1), scale=scale, confidence=np.linspace(0.1, 1, N))
@@ -165,6 +166,7 @@ def test_enlarging_the_target_enlarges_the_scale(x64):
     np.testing.assert_array_equal(known.inliers, solve(problem_of(matches, scale=1.3)).inliers)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scale", "variant", "noise"),
     [(1.3, "default", 0.6), (None, "default", 0.6), (None, "complete cascade", 1.0)],
@@ -239,6 +241,7 @@ def test_truncation_is_in_units_of_the_bounds(scale, x64):
     assert np.all(np.asarray(wide.inliers)[matches.inliers])
 
 
+@pytest.mark.long
 def test_the_refined_cost_is_never_above_that_of_the_cascade(x64):
     for seed in range(10):
         problem = problem_of(random_matches(seed, N, wrong=0.4, noise_bound=0.2, scale=1.3), scale=None)
@@ -249,6 +252,7 @@ def test_the_refined_cost_is_never_above_that_of_the_cascade(x64):
 # --- given pairs ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_chain_of_pairs_on_good_matches_keeps_them_all(x64):
     matches = random_matches(9, 100, wrong=0, noise=0.8, scale=1.3)
     problem = problem_of(matches, scale=None, pairs=[(i, i + 1) for i in range(99)])
@@ -263,6 +267,7 @@ def test_a_chain_of_pairs_on_good_matches_keeps_them_all(x64):
 # --- settings -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_every_setting_finds_the_right_matches(variant, x64):
     settings = VARIANTS[variant]
@@ -283,6 +288,7 @@ def test_every_setting_finds_the_right_matches(variant, x64):
             np.testing.assert_array_equal(solution.inliers, axes.all(axis=1) & solution.selection.clique)
 
 
+@pytest.mark.long
 def test_without_pruning_nothing_is_proved_and_eager_equals_jit(x64):
     matches, settings = matches_of(0, wrong=0.1), tj.Settings(clique="none")
     solution = solve(problem_of(matches, scale=1.3), settings)
@@ -295,6 +301,7 @@ def test_without_pruning_nothing_is_proved_and_eager_equals_jit(x64):
 # --- dtypes ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @both_scales
 def test_float32_stays_float32_and_jax_stays_as_it_was(scale):
     before = jax.config.jax_enable_x64
@@ -354,12 +361,13 @@ def test_the_smallest_problems_end_finite(n, x64):
 @pytest.mark.parametrize("name", ["scale", "cbar2"])
 def test_a_traced_scale_or_truncation_that_makes_no_sense_ends_finite(name, bad, x64):
     problem = problem_of(matches_of(1), scale=1.3)
-    solution = solve(replace(problem, **{name: jnp.asarray(bad)}))
+    solution = solve(replace(problem, **{name: jnp.asarray(bad, problem.src.dtype)}))
     assert_finite(solution)
     assert int(solution.status) == tj.Status.TOO_FEW_POINTS
 
 
-def test_a_solution_is_shown_in_a_line_or_two():
-    problem = problem_of(matches_of(1), scale=1.3)
+@pytest.mark.long
+def test_a_solution_is_shown_in_a_line_or_two(x64):
+    problem = problem_of(matches_of(1), scale=None)
     assert "OK" in repr(solve(problem))
-    assert f"inliers of shape (2, {N})" in repr(solve_batch(tj.stack_problems([problem, problem])))
+    assert f"inliers of shape ({STACK}, {N})" in repr(solve_stack(tj.stack_problems([problem] * STACK)))

@@ -26,6 +26,7 @@ def test_the_rotation_the_sets_the_cost_and_the_proof(method):
     assert "30 measurements" in repr(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("k", "runs"), [(40, 10), pytest.param(100, 10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("wrong", [0.8, 0.9])
 def test_hard_rates_are_solved_and_most_are_certified(k, runs, wrong):
@@ -64,6 +65,7 @@ def test_a_bound_for_each_and_vectors_of_no_length():
     assert_allclose(found.cost, np.minimum(r2, 1).sum())
 
 
+@pytest.mark.long
 def test_under_jit_and_vmap_and_in_float32():
     drawn = [draw_vectors(seed, 16, 0.5) for seed in range(3)]
     src, dst = (np.stack([d[i] for d in drawn]) for i in range(2))

@@ -59,6 +59,7 @@ def quick(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_a_killed_study_loses_and_repeats_no_row(tmp_path):
     table, runs = tmp_path / "translation" / "table.csv", 30
     command = [*COMMAND, "translation", "--folder", str(tmp_path), "--runs", str(runs), "--method", "TLS"]
@@ -81,20 +82,21 @@ def test_a_killed_study_loses_and_repeats_no_row(tmp_path):
     )
 
 
-def test_two_processes_write_the_rows_of_one(tmp_path):
+@pytest.mark.long
+def test_two_processes_write_the_rows_of_one(quick, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
+    run_study("translation", tmp_path / "alone", quick=True, runs=2, methods=TLS)
     # One method takes its trials together, the other one by one.
-    for study, method in (("known-scale", "teaser_jax"), ("translation", "TLS")):
+    for study, method, alone in (
+        ("known-scale", "teaser_jax", quick), ("translation", "TLS", tmp_path / "alone")
+    ):  # fmt: skip
         command = [*COMMAND, study, "--folder", str(tmp_path), "--quick", "--runs", "2", "--method", method]
         both = [subprocess.Popen([*command, "--cluster", f"{address},2,{k}"], env=ON_CPU) for k in range(2)]
         assert [each.wait(timeout=300) for each in both] == [0, 0]
-        run_study(study, tmp_path / "alone", quick=True, runs=2, methods=[method])
-        shared, alone = (
-            read_table(folder / study / "table.csv") for folder in (tmp_path, tmp_path / "alone")
-        )
-        assert without_times(shared) == without_times(alone)
+        shared, of_one = (read_table(folder / study / "table.csv") for folder in (tmp_path, alone))
+        assert without_times(shared) == without_times(row for row in of_one if row["method"] == method)
 
 
 def test_a_row_cut_in_the_middle_is_computed_again(tmp_path):
@@ -158,6 +160,7 @@ def test_a_model_that_cannot_be_drawn_from_leaves_no_folder(tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.long
 def test_figures_without_a_place_are_said(quick, tmp_path):
     folder = shutil.copytree(quick, tmp_path / "studies")
     picture = folder / "known-scale" / "figure.png"
@@ -220,6 +223,7 @@ def test_a_broken_table_is_named(tmp_path, content, said):
         read_table(tmp_path / "t.csv")
 
 
+@pytest.mark.long
 def test_answers_are_right_and_all_methods_see_the_same_problems(quick):
     results = read_results(quick / "known-scale")
     assert results.values == [0.0, 0.5, 0.9]
@@ -233,6 +237,7 @@ def test_answers_are_right_and_all_methods_see_the_same_problems(quick):
     assert results.measured("teaser_jax", 0.5, "together").tolist() == [2, 2]
 
 
+@pytest.mark.long
 def test_the_figure_is_drawn_and_the_page_stands_alone(quick):
     place = quick / "known-scale"
     assert (place / "figure.png").read_bytes().startswith(b"\x89PNG")

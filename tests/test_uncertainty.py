@@ -8,15 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles import problem_of, random_matches
+from oracles import problem_of, random_matches, solve
 from scipy.stats import chi2
 
 import teaser_jax as tj
 from teaser_jax.uncertainty import pose_difference
 
-N, RUNS, SIGMA = 40, 300, 0.01
+N, RUNS, SIGMA = 32, 300, 0.01
 GREEDY = tj.Settings(clique="greedy")
 CONVENTIONS = ("right", "gtsam", "g2o", "ros")
+# One program for all: each by itself takes as long to compile.
+in_all_conventions = jax.jit(
+    lambda problem, solution: [tj.covariance(problem, solution, SIGMA, convention=c) for c in CONVENTIONS]
+)
 
 
 def error_between(answer: tj.Pose, truth: tj.Pose, convention: str, unknown: bool) -> jax.Array:
@@ -36,6 +40,7 @@ def error_between(answer: tj.Pose, truth: tj.Pose, convention: str, unknown: boo
     return jnp.concatenate([*found, *last])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scale", "refine"),
     [
@@ -80,27 +85,29 @@ def test_errors_are_as_large_as_the_covariance_says(scale, refine, x64):
         np.testing.assert_allclose(other, squares[:, 0], rtol=0.05)
 
 
+@pytest.mark.long
 def test_covariance_and_information_are_inverse_and_symmetric(x64):
     problem = problem_of(random_matches(4, N, wrong=0.3), scale=None)
-    solution = jax.jit(tj.solve)(problem)
-    for convention in CONVENTIONS:
-        found = tj.covariance(problem, solution, SIGMA, convention=convention)
-        assert found.convention == convention
+    several = in_all_conventions(problem, solve(problem))
+    assert [found.convention for found in several] == list(CONVENTIONS)
+    for found in several:
         np.testing.assert_allclose(found.covariance @ found.information, np.eye(7), atol=1e-8)
         np.testing.assert_allclose(found.covariance, found.covariance.T, atol=1e-18)
         np.testing.assert_array_less(0, np.linalg.eigvalsh(found.covariance))
 
 
+@pytest.mark.long
 def test_least_squares_has_the_covariance_of_its_normal_equations(x64):
     matches = random_matches(5, N, wrong=0.0, noise=0.1)
     problem = problem_of(matches)
-    found = tj.covariance(problem, jax.jit(tj.solve)(problem), SIGMA)
-    rotation = np.asarray(jax.jit(tj.solve)(problem).pose.rotation)
+    solution = solve(problem)
+    found, rotation = tj.covariance(problem, solution, SIGMA), solution.pose.rotation
     rows = [np.hstack([-rotation @ np.asarray(tj.so3.hat(a)), rotation]) for a in matches.src]
     information = sum(row.T @ row for row in rows) / SIGMA**2
     np.testing.assert_allclose(found.information, information, rtol=0.02, atol=1e-3 * information.max())
 
 
+@pytest.mark.long
 def test_the_deviation_can_be_estimated():
     matches = random_matches(6, 400, wrong=0.2, noise=0.0, noise_bound=0.06)
     rng = np.random.default_rng(0)
@@ -112,16 +119,18 @@ def test_the_deviation_can_be_estimated():
     np.testing.assert_allclose(guessed.covariance, told.covariance, rtol=0.1)
 
 
+@pytest.mark.long
 def test_an_answer_that_failed_knows_nothing(x64):
     problem = problem_of(random_matches(14, N, wrong=1.0))
-    found = tj.covariance(problem, jax.jit(tj.solve)(problem), SIGMA)
+    found = tj.covariance(problem, solve(problem), SIGMA)
     np.testing.assert_array_equal(found.information, 0)
     assert np.all(np.isinf(np.diag(found.covariance)))
 
 
+@pytest.mark.long
 def test_no_noise_is_exact(x64):
     problem = problem_of(random_matches(7, N, wrong=0.3))
-    found = tj.covariance(problem, jax.jit(tj.solve)(problem), 0.0)
+    found = tj.covariance(problem, solve(problem), 0.0)
     np.testing.assert_array_equal(found.covariance, 0)
     assert np.all(np.isinf(np.diag(found.information)))
 
@@ -141,7 +150,7 @@ def test_bad_arguments_are_told_apart():
 def test_the_difference_of_equal_poses_is_zero_and_has_a_finite_gradient(x64):
     pose = jax.tree.map(jnp.asarray, random_matches(0).truth)
     np.testing.assert_allclose(pose_difference(pose, pose), 0, atol=1e-15)
-    slope = jax.grad(lambda p: jnp.sum(pose_difference(p, pose, with_scale=True)))(pose)
+    slope = jax.jit(jax.grad(lambda p: jnp.sum(pose_difference(p, pose, with_scale=True))))(pose)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(slope))
 
 
@@ -160,6 +169,7 @@ def test_a_stack_and_a_solution_of_another_problem_are_refused():
         tj.covariance(result.problem, other.solution)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1.0, None])
 @pytest.mark.parametrize("offset", [100.0, 1000.0])
 def test_far_origins_keep_a_finite_information(scale, offset):
