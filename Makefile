@@ -44,6 +44,7 @@ test: $(READY) ## Run the tests, without the slow ones
 quick: $(READY) ## Run the tests that compile little: a minute, for the inner loop
 	@$(BIN)/python $(TEST) -m "not slow and not long"
 
+slow: export TEASER_JAX_OPTIMIZED ?= 1
 slow: $(READY) ## Run the slow tests
 	@$(BIN)/python $(TEST) -m slow
 

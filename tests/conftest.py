@@ -5,7 +5,17 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
+
+# Most of a test is compilation, and what is compiled runs for milliseconds: XLA optimises little here, which
+# takes a quarter of the time. `register`, `solve_batch` and certificates choose their own options, and keep
+# them. With TEASER_JAX_OPTIMIZED=1, as in `make slow`, all programs are those of a user.
+if not os.environ.get("TEASER_JAX_OPTIMIZED"):
+    os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    if tuple(map(int, version("jax").split(".")[:2])) < (0, 11):  # newer ones have no older emitters
+        flags = "--xla_cpu_use_fusion_emitters=false --xla_disable_hlo_passes=tree_reduction_rewriter"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
 
 import jax
 import pytest
