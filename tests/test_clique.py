@@ -311,4 +311,6 @@ def test_warming_runs_through_every_loop():
         reduction: ("degrees", "induced", "degeneracy_order", "grow_clique", "peel", "drop_weak_edges"),
         branching: ("colour", "root_bounds", "branch"),
     }
-    assert not [name for room, names in called.items() for name in names if not getattr(room, name).signatures]
+    assert not [
+        name for room, names in called.items() for name in names if not getattr(room, name).signatures
+    ]

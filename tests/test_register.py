@@ -215,6 +215,9 @@ def test_after_warmup_nothing_compiles(most, stream):
     for n, rate in stream:
         drawn = random_problem(n, n=n, outlier_rate=rate, radius=1.0)
         tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+    # Numbers and budgets are sent, whole ones too.
+    other = tj.Settings(rotation=Gnc(factor=2, tolerance=0), clique=ExactClique(nodes=10, seconds=5))
+    tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound, settings=other)
     assert not compiled
     new = tj.Settings(rotation=Gnc(iterations=100 + most))
     tj.register(drawn.src[:10], drawn.dst[:10], noise_bound=0.05, settings=new)
