@@ -24,9 +24,9 @@ class Pose:
     Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind.
     """
 
-    rotation: Float[AnyArray, "*batch 3 3"] | Placeholder
-    translation: Float[AnyArray, "*batch 3"] | Placeholder
-    scale: Float[AnyArray, "*batch"] | Placeholder
+    rotation: Float[AnyArray, "... 3 3"] | Placeholder
+    translation: Float[AnyArray, "... 3"] | Placeholder
+    scale: Float[AnyArray, "..."] | Placeholder
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Pose:

@@ -30,14 +30,14 @@ class Problem:
         pairs: Index pairs whose TIMs are used, or None for all. A pair (i, i) is padding.
     """
 
-    src: Float[AnyArray, "*batch n 3"] | Placeholder
-    dst: Float[AnyArray, "*batch n 3"] | Placeholder
-    noise_bound: Float[AnyArray, "*batch n"] | Placeholder
-    cbar2: Float[AnyArray, "*batch"] | Placeholder
-    mask: Bool[AnyArray, "*batch n"] | Placeholder
-    confidence: Float[AnyArray, "*batch n"] | Placeholder
-    scale: Float[AnyArray, "*batch"] | Placeholder | None = None
-    pairs: Int[AnyArray, "*batch m 2"] | Placeholder | None = None
+    src: Float[AnyArray, "... n 3"] | Placeholder
+    dst: Float[AnyArray, "... n 3"] | Placeholder
+    noise_bound: Float[AnyArray, "... n"] | Placeholder
+    cbar2: Float[AnyArray, "..."] | Placeholder
+    mask: Bool[AnyArray, "... n"] | Placeholder
+    confidence: Float[AnyArray, "... n"] | Placeholder
+    scale: Float[AnyArray, "..."] | Placeholder | None = None
+    pairs: Int[AnyArray, "... m 2"] | Placeholder | None = None
 
 
 def make_problem(

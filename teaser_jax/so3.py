@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.ground.arrays import rounded_product as times
@@ -94,7 +94,9 @@ def _axes_of_one(matrix: Float[Array, "3 3"]) -> Axes:
 
 
 @_axes_of_one.def_vmap
-def _axes_of_many(size: int, batched: Any, matrices: Float[Array, "k 3 3"]) -> tuple[Axes, Any]:
+def _axes_of_many(
+    size: int, batched: Any, matrices: Float[Array, "k 3 3"]
+) -> tuple[tuple[Float[Array, "k 2 3"], Float[Array, "k 2 3"]], tuple[bool, bool]]:
     # LAPACK takes matrices one by one; turns of columns are vector work: a quarter of the time from 64 on.
     # This may be traced after the block that allowed float64 has ended: its numbers must stay what they are.
     with jax.enable_x64(True) if matrices.dtype == jnp.float64 else nullcontext():
@@ -120,7 +122,7 @@ def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
     eye = jnp.eye(3, dtype=dtype)
     tiny = jnp.finfo(dtype).tiny
 
-    def turn(_: int, rows: Array) -> Array:  # row k holds column k of A and of V: both turn alike
+    def turn(_: Int[Array, ""], rows: Float[Array, "3 6"]) -> Float[Array, "3 6"]:  # row k holds column k of A and of V: both turn alike
         x, y = rows[0], rows[1]
         xx, yy, xy = (_inner(u[:3], v[:3]) for u, v in ((x, x), (y, y), (x, y)))
         done = jnp.abs(xy) <= 8 * tiny
@@ -180,8 +182,8 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     References: Yang, Shi, Carlone, T-RO 2020, eq. (12) without truncation; Horn 1987.
     """
     left, right = _leading_axes(matrix)
-    third = times(_cross(left[0], left[1])[:, None], _cross(right[0], right[1]))
-    return times(left[0][:, None], right[0]) + times(left[1][:, None], right[1]) + third
+    third = times(_cross(left[0], left[1])[:, None], _cross(right[0], right[1])[None])
+    return times(left[0][:, None], right[0][None]) + times(left[1][:, None], right[1][None]) + third
 
 
 @nearest_rotation.defjvp

@@ -46,9 +46,9 @@ class SoftSolution:
     """
 
     pose: Pose
-    weights: Float[AnyArray, "*batch n"] | Placeholder
-    status: Int[AnyArray, "*batch"] | Placeholder
-    cost: Float[AnyArray, "*batch"] | Placeholder
+    weights: Float[AnyArray, "... n"] | Placeholder
+    status: Int[AnyArray, "..."] | Placeholder
+    cost: Float[AnyArray, "..."] | Placeholder
     solution: Solution
 
     @property
@@ -225,7 +225,7 @@ def _curvature(data: _Data, pose: Pose) -> _Curvature:
     diagonal = jnp.diagonal(matrix)
     upward = diagonal > 0
     unit = lax.rsqrt(jnp.where(upward, diagonal, 1))
-    matrix = unit[:, None] * 0.5 * (matrix + matrix.T) * unit
+    matrix = unit[:, None] * 0.5 * (matrix + matrix.T) * unit[None]
     frozen = jnp.where(jnp.isfinite(matrix), lax.stop_gradient(matrix), 0)
     least = jnp.linalg.eigvalsh(frozen)[0]
     determined = jnp.all(upward) & (least > 64 * jnp.finfo(dtype).eps)

@@ -65,12 +65,12 @@ class Selection:
         refined: Whether the pose is the joint fit to ``inliers``.
     """
 
-    scale_pairs: UInt32[AnyArray, "*batch n w"] | Bool[AnyArray, "*batch m"] | Placeholder | None
-    clique: Bool[AnyArray, "*batch n"] | Placeholder
-    rotation: Bool[AnyArray, "*batch k"] | UInt32[AnyArray, "*batch n w"] | Placeholder
-    translation: Bool[AnyArray, "*batch n 3"] | Placeholder
-    inliers: Bool[AnyArray, "*batch n"] | Placeholder
-    refined: Bool[AnyArray, "*batch"] | Placeholder
+    scale_pairs: UInt32[AnyArray, "... n w"] | Bool[AnyArray, "... m"] | Placeholder | None
+    clique: Bool[AnyArray, "... n"] | Placeholder
+    rotation: Bool[AnyArray, "... k"] | UInt32[AnyArray, "... n w"] | Placeholder
+    translation: Bool[AnyArray, "... n 3"] | Placeholder
+    inliers: Bool[AnyArray, "... n"] | Placeholder
+    refined: Bool[AnyArray, "..."] | Placeholder
 
 
 @jax.tree_util.register_dataclass
@@ -92,13 +92,13 @@ class Solution:
 
     pose: Pose
     selection: Selection
-    inliers: Bool[AnyArray, "*batch n"] | Placeholder
-    status: Int[AnyArray, "*batch"] | Placeholder
-    clique_size: Int[AnyArray, "*batch"] | Placeholder
-    clique_upper_bound: Int[AnyArray, "*batch"] | Placeholder
-    clique_is_maximum: Bool[AnyArray, "*batch"] | Placeholder
-    excluded: Int[AnyArray, "*batch"] | Placeholder
-    cost: Float[AnyArray, "*batch"] | Placeholder
+    inliers: Bool[AnyArray, "... n"] | Placeholder
+    status: Int[AnyArray, "..."] | Placeholder
+    clique_size: Int[AnyArray, "..."] | Placeholder
+    clique_upper_bound: Int[AnyArray, "..."] | Placeholder
+    clique_is_maximum: Bool[AnyArray, "..."] | Placeholder
+    excluded: Int[AnyArray, "..."] | Placeholder
+    cost: Float[AnyArray, "..."] | Placeholder
 
     @property
     def ok(self) -> Bool[AnyArray, ""]:

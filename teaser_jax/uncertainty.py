@@ -40,8 +40,8 @@ class Uncertainty:
         convention: Which coordinates, as asked for.
     """
 
-    covariance: Float[AnyArray, "*batch d d"] | Placeholder
-    information: Float[AnyArray, "*batch d d"] | Placeholder
+    covariance: Float[AnyArray, "... d d"] | Placeholder
+    information: Float[AnyArray, "... d d"] | Placeholder
     convention: Convention = field(metadata={"static": True})
 
 
@@ -168,11 +168,11 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
     middle = lax.stop_gradient(_middle(p, solution.inliers))
     here = lax.stop_gradient(pose.apply(middle[None])[0])
     about = replace(pose, translation=jnp.zeros_like(pose.translation))
-    near = replace(p, src=p.src - middle, dst=p.dst - here)
+    near = replace(p, src=p.src - middle[None], dst=p.dst - here[None])
     to_first_order = lambda dst: _coordinates(refit(replace(near, dst=dst), solution.selection), about, p)
     slope = jax.jacrev(to_first_order)(near.dst)  # (d, n, 3)
     deviation = jnp.broadcast_to(deviation, p.mask.shape)
-    weighted = slope * jnp.where(p.mask & jnp.isfinite(deviation), deviation, 0)[:, None]
+    weighted = slope * jnp.where(p.mask & jnp.isfinite(deviation), deviation, 0)[None, :, None]
     found = jnp.einsum("ani,bni->ab", weighted, weighted, precision=lax.Precision.HIGHEST)
     eye = jnp.eye(len(found), dtype=found.dtype)
     sensible = jnp.all(jnp.where(solution.inliers, jnp.isfinite(deviation) & (deviation >= 0), True))
@@ -180,11 +180,11 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
     # Angles and lengths may be of very different size: invert in units of the deviations.
     spread = jnp.diagonal(found)
     unit = lax.rsqrt(jnp.where(known & (spread > 0), spread, 1))
-    normalised = jnp.where(known, unit[:, None] * found * unit, eye)
+    normalised = jnp.where(known, unit[:, None] * found * unit[None], eye)
     least = jnp.linalg.eigvalsh(lax.stop_gradient(normalised))[0]
     exact = least <= 8 * jnp.finfo(found.dtype).eps  # some combination of coordinates has no noise at all
-    inverse = unit[:, None] * jnp.linalg.inv(jnp.where(exact, eye, normalised)) * unit
-    infinite = jnp.where(eye > 0, jnp.inf, 0)
+    inverse = unit[:, None] * jnp.linalg.inv(jnp.where(exact, eye, normalised)) * unit[None]
+    infinite = jnp.where(eye > 0, jnp.inf, 0.0)
     to_origin = _moved_origin(middle * pose.scale, len(found))
     from_origin = _moved_origin(-middle * pose.scale, len(found))
     change = _change(pose, len(found), convention)

@@ -24,13 +24,18 @@ def pack(mask: Bool[Array, "*k n"]) -> UInt32[Array, "*k w"]:
     *batch, n = mask.shape
     padded = jnp.pad(mask, [(0, 0)] * len(batch) + [(0, words(n) * LANES - n)])
     lanes = padded.reshape(*batch, words(n), LANES).astype(jnp.uint32)
-    return jnp.sum(lanes << jnp.arange(LANES, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
+    return jnp.sum(lanes << _each_lane(lanes.ndim), axis=-1, dtype=jnp.uint32)
 
 
 def unpack(packed: UInt32[Array, "*k w"], n: int) -> Bool[Array, "*k n"]:
     """Words as a mask of n bits along the last axis."""
-    bits = (packed[..., None] >> jnp.arange(LANES, dtype=jnp.uint32)) & 1
+    bits = (packed[..., None] >> _each_lane(packed.ndim + 1)) & 1
     return bits.reshape(*packed.shape[:-1], -1)[..., :n].astype(bool)
+
+
+def _each_lane(ndim: int) -> UInt32[Array, "*ones 32"]:
+    """The numbers of the lanes, along the last of so many axes."""
+    return lax.broadcast_to_rank(jnp.arange(LANES, dtype=jnp.uint32), ndim)
 
 
 def no_bits(n: int) -> UInt32[Array, "n w"]:

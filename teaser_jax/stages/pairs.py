@@ -95,12 +95,12 @@ def fold_pairs(
     @jax.checkpoint
     def step(carry: Carry, lane: tuple) -> tuple[Carry, None]:
         t, use, beta, *columns = lane
-        difference = [row - column for row, column in zip(rows[:6], columns, strict=True)]
+        difference = [row - column[None] for row, column in zip(rows[:6], columns, strict=True)]
         visited = PairSlice(
             tuple(difference[:3]),
             tuple(difference[3:]),
-            rows[6] + beta,
-            mask[:, None] & use & (index != starts + t),
+            rows[6] + beta[None],
+            mask[:, None] & use[None] & (index != starts[None] + t),
         )
         return body(carry, t, visited), None
 

@@ -69,7 +69,7 @@ def fit_similarity(
     total, count = sums[0, 0], sums[1, 0]
     means = sums[0, 1:] / jnp.where(total > 0, total, 1)
     src_mean, dst_mean = means[:3], means[3:]
-    a, b = src - src_mean, dst - dst_mean
+    a, b = src - src_mean[None], dst - dst_mean[None]
     # Rounding would turn the fit of one or two points at random.
     h = jnp.where(count > 2.5, correlation(weights, a, b), 0)
     rotation = so3.nearest_rotation(h)
@@ -78,7 +78,7 @@ def fit_similarity(
         some = below > 0
         scale = jnp.sum(rotation * h) / jnp.where(some, below, 1)
         scale = jnp.where(some & (scale > 0), scale, 1)
-    translation = dst_mean - scale * jnp.sum(rotation * src_mean, axis=1)
+    translation = dst_mean - scale * jnp.sum(rotation * src_mean[None], axis=1)
     return Fit(Pose(rotation, translation, scale), h, src_mean)
 
 

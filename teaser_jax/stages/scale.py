@@ -141,7 +141,7 @@ def scale_of_pairs(
         # Weights per pair are products c_i c_j: fold them in as rows against columns.
         def add(sums: tuple[Array, Array], lane: Array, visited: PairSlice) -> tuple[Array, Array]:
             hit = bits.lane_of(chosen, lane) & visited.valid
-            both = confidence[:, None] * by_lane[lane]
+            both = confidence[:, None] * by_lane[lane][None]
             weight = jnp.where(hit, both / visited.bounds**2, 0)
             a2, b2 = squared_norm(visited.src_tims), squared_norm(visited.dst_tims)
             return sums[0] + jnp.sum(weight * safe_sqrt(a2 * b2)), sums[1] + jnp.sum(weight * a2)
@@ -184,7 +184,7 @@ class CompleteTrims:
         values, _, voters = self.row(jnp.int32(0))
         voters &= values > 0
         total = jnp.sum(jnp.log(jnp.where(voters, values, 1)))
-        return jnp.exp(total / jnp.maximum(jnp.sum(voters, dtype=jnp.int32), 1))
+        return jnp.exp(total / jnp.maximum(jnp.sum(voters, dtype=jnp.int32), 1).astype(total.dtype))
 
     def _trims(self, k: Array, i: Array, these: Any, others: Any) -> tuple[Array, Array, Array]:
         difference = [y - x for x, y in zip(these[:6], others[:6], strict=True)]

@@ -165,7 +165,7 @@ def repeats(problem: Problem) -> Bool[Array, " n"]:
         return jnp.zeros(0, bool)
     rows = jnp.concatenate([problem.src, problem.dst], axis=1)
     words = lax.bitcast_convert_type(rows.astype(jnp.float32), jnp.uint32)
-    mixed = jnp.sum(words * MIX_ROW, axis=1, dtype=jnp.uint32)
+    mixed = jnp.sum(words * MIX_ROW[None], axis=1, dtype=jnp.uint32)
     slots_log2 = max(4, (16 * n - 1).bit_length())
     slot = ((mixed ^ (mixed >> 15)) * MIX_SUM >> (32 - slots_log2)).astype(jnp.int32)
     index = jnp.arange(n, dtype=jnp.int32)
@@ -189,7 +189,7 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
     turned = jnp.sum(pose.rotation[:, :, None] * fit.correlation[:, None, :], axis=0)
     left = jnp.trace(turned) - so3.largest_eigenvalue((turned + turned.T) / 2)
     rise = 2 * (1 - np.cos(SMALLEST_TURN)) * pose.scale * left / jnp.where(most > 0, most, 1)
-    radius2 = jnp.where(inliers, jnp.sum((problem.src - fit.src_mean) ** 2, axis=1), 0)
+    radius2 = jnp.where(inliers, jnp.sum((problem.src - fit.src_mean[None]) ** 2, axis=1), 0)
     reach2 = jnp.where(inliers, problem.cbar2 * problem.noise_bound**2, jnp.inf)
     extended = pose.scale**2 * jnp.max(radius2, initial=0) > jnp.min(reach2, initial=jnp.inf)
     return (rise >= problem.cbar2) & extended
@@ -249,9 +249,9 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
     by_turn, offset = lax.optimization_barrier((by_turn, offset))
     residual2 = jnp.zeros((), src.dtype)
     for i in range(3):
-        moved = sum(by_turn[i, j][:, None] * x[j] for j in range(3))
-        residual2 += (y[i] - offset[i][:, None] - moved) ** 2
-    agree = (residual2 <= problem.cbar2 * problem.noise_bound**2) & mask
+        moved = sum(by_turn[i, j][:, None] * x[j][None] for j in range(3))
+        residual2 += (y[i][None] - offset[i][:, None] - moved) ** 2
+    agree = (residual2 <= (problem.cbar2 * problem.noise_bound**2)[None]) & mask[None]
     return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
 
 

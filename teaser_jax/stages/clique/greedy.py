@@ -94,7 +94,7 @@ def _grow(edge_bits: Array, degree: Array, index: Array, seed: Array) -> Array:
 
     def once(state: Growth) -> Growth:
         inside = state.inside
-        joined = bits.count(edge_bits & bits.pack(inside))  # neighbours inside
+        joined = bits.count(edge_bits & bits.pack(inside)[None])  # neighbours inside
         size = jnp.sum(inside, dtype=jnp.int32)
         lowest = jnp.min(jnp.where(inside, joined, size))
         # The seed is joined to all, so the range ends at size - 1 and the seed stays.
@@ -124,7 +124,7 @@ def peeling_bound(
         changed: Array
 
     def once(state: Peel) -> Peel:
-        degree = bits.count(edge_bits & bits.pack(state.alive))
+        degree = bits.count(edge_bits & bits.pack(state.alive)[None])
         alive = state.alive & (degree >= lower)
         return Peel(alive, degree, jnp.any(alive != state.alive))
 

@@ -170,7 +170,7 @@ def correlation_of_pairs(
 
     def add(total: Array, lane: Array, visited: PairSlice) -> Array:
         hit = bits.lane_of(chosen, lane) & visited.valid
-        weight = jnp.where(hit, confidence[:, None] * by_lane[lane] / visited.bounds**2, 0)
+        weight = jnp.where(hit, confidence[:, None] * by_lane[lane][None] / visited.bounds**2, 0)
         return total + _pair_correlation(weight, visited)
 
     by_lane, everything = bits.in_lanes(confidence), jnp.ones(src.shape[0], bool)

@@ -60,7 +60,10 @@ class Axis(NamedTuple):
     def part(self, first: Int[Array, ""], last: Int[Array, ""]) -> Axis:
         """The axis of the bins from the first to the last."""
         width = (self.high - self.low) / BINS
-        return self._replace(low=self.low + (first - 1) * width, high=self.low + last * width)
+        return self._replace(
+            low=self.low + (first - 1).astype(width.dtype) * width,
+            high=self.low + last.astype(width.dtype) * width,
+        )
 
     def middle(self) -> Float[Array, ""]:
         """A number near the middle."""
@@ -316,7 +319,7 @@ def _bounds(h: Histogram, q: Question, cbar2: Array, interval: tuple[Any, Any]) 
     upper, _, lost = gain_at(
         begun[:, :-2] - ended[:, 1:-1], jnp.where(free, left, low), jnp.where(free, right, high)
     )
-    upper += jnp.where(free, h.partial, cbar2 * touching)[1:-1]
+    upper += jnp.where(free, h.partial, cbar2 * touching.astype(dtype))[1:-1]
     upper = lost + jnp.where((sets[3, 1:] > 0.5) | (touching[1:-1] > 0), upper, -jnp.inf)
     outside = jnp.full(1, -jnp.inf, dtype)
     own = entering - leaving
@@ -347,7 +350,9 @@ def _sweep(
         ranks = rank(inside)
         slot = jnp.where(inside, count + ranks - 1, room)
         # A beginning is kept as 1 + its running number, an ending as the negative; 0 is empty.
-        number = 1 + k.astype(jnp.int64) * measurements.length + _counting(measurements.length)
+        number = (
+            1 + k.astype(jnp.int64) * measurements.length + _counting(measurements.length).astype(jnp.int64)
+        )
         ids = ids.at[slot].set(jnp.concatenate([number, -number]), mode="drop")
         return ids, count + ranks[-1]
 
@@ -361,7 +366,7 @@ def _sweep(
     at = _intervals(measurements.recall(whose, which), q, cbar2)
     sign = jnp.where(taken, jnp.where(begins, 1, -1), 0).astype(q.centre.dtype)
     weight = 1 / at.bound**2
-    own = jnp.stack([weight, weight * at.offset, weight * at.offset**2, jnp.ones_like(weight)]) * sign
+    own = jnp.stack([weight, weight * at.offset, weight * at.offset**2, jnp.ones_like(weight)]) * sign[None]
     value = jnp.where(taken, jnp.where(begins, at.begin, at.end), jnp.inf)
     # All other bins stand in the sweep as one step each, at the edge where they end.
     steps = jnp.where(piece, 0, q.own)[:, :-1]

@@ -77,7 +77,7 @@ def vote(
     who = jnp.where(entering, order, order - k)
     moments = jnp.stack([weights, weights * offsets, weights * offsets**2, voters.astype(dtype)])
     found, witness, _ = best_set(
-        ends[order], running_sums(moments[:, who] * sign), centre,
+        ends[order], running_sums(moments[:, who] * sign[None]), centre,
         cbar2=cbar2, criterion=criterion, interval=interval,
     )  # fmt: skip
     members = voters & (jnp.abs(witness - offsets) <= reach) & found
