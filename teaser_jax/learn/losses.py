@@ -191,7 +191,7 @@ def matching_loss(
 
 
 def _same_place(
-    pose: Pose, src: Array, dst: Array, src_mask: Array, dst_mask: Array, radius: AnyArray
+    pose: Pose, src: AnyArray, dst: AnyArray, src_mask: Array, dst_mask: Array, radius: AnyArray
 ) -> tuple[Bool[Array, "n m"], Bool[Array, "n m"]]:
     """Tell which pairs of points are the same place under a pose, and which of all pairs are asked about."""
     src_mask &= jnp.all(jnp.isfinite(src), axis=1)
@@ -205,7 +205,7 @@ def _same_place(
     return same, same | (both & (distance2 > 4 * radius**2))
 
 
-def _distance(x: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+def _distance(x: Float[AnyArray, "*batch 3"]) -> Float[Array, "*batch"]:
     """Measure lengths with gradient zero at zero; a NaN stays NaN."""
     length2 = jnp.sum(x * x, axis=-1)
     some = length2 != 0

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from teaser_jax.ground.arrays import Number
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -16,7 +18,7 @@ SRC, DST, GOOD, BAD, INK, PALE = "#e4842d", "#3a6ea5", "#1f9d55", "#c8443b", "#3
 LEGEND_COLUMNS = 5
 
 
-def new_figure(size: tuple[float, float]) -> Figure:
+def new_figure(size: tuple[Number, Number]) -> Figure:
     """Make an empty figure of a size [inch], bound to no backend.
 
     Raises:

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float, Int, Real
 
+from teaser_jax.ground.arrays import Number
+
 Points: TypeAlias = Float[np.ndarray, "n 3"]
 Seed: TypeAlias = int | np.integer | Sequence[int] | np.random.SeedSequence
 
@@ -83,7 +85,7 @@ def teapot(n: int) -> Points:
 def _teapot_distance(x: Points) -> Float[np.ndarray, " n"]:
     """Measure how far points are outside the teapot, a blend of simple solids; negative inside."""
 
-    def ball(centre: Sequence[float], radii: Any) -> np.ndarray:
+    def ball(centre: Sequence[Number], radii: Any) -> np.ndarray:
         return (np.linalg.norm((x - centre) / radii, axis=1) - 1) * np.min(radii)
 
     def blend(a: np.ndarray, b: np.ndarray, width: float = 0.07) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 from teaser_jax.ground.arrays import Number
 from teaser_jax.pose import Pose
@@ -28,8 +28,8 @@ class ScanPair:
         truth: ``T_dst_src``.
     """
 
-    src: Points
-    dst: Points
+    src: Float[np.ndarray, "n 3"]
+    dst: Float[np.ndarray, "m 3"]
     src_viewpoint: Vector
     dst_viewpoint: Vector
     truth: Pose
@@ -37,7 +37,7 @@ class ScanPair:
 
 def scan_pair(
     seed: Seed,
-    model: Points,
+    model: Real[np.ndarray, "m 3"],
     *,
     n: int = 640,
     sigma: Number = 0.005,
@@ -75,7 +75,13 @@ def scan_pair(
 
 
 def partial_scan(
-    seed: Seed | np.random.Generator, model: Points, view: Vector, *, n: int, sigma: Number, cells: int = 40
+    seed: Seed | np.random.Generator,
+    model: Real[np.ndarray, "m 3"],
+    view: Real[np.ndarray, "3"],
+    *,
+    n: int,
+    sigma: Number,
+    cells: int = 40,
 ) -> Points:
     """Scan the side of a model that is seen from a direction, with Gaussian noise.
 
