@@ -10,7 +10,7 @@ so that new ones compile nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeAlias, get_args
 
 import jax
@@ -39,7 +39,7 @@ ROTATIONS = {"gnc": Gnc, "global": PairSearch, "sdp": Relaxation}
 
 
 @jax.tree_util.register_dataclass
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Settings:
     """How to solve. Choices and caps are static under jit, numbers are traced.
 
@@ -78,6 +78,11 @@ class Settings:
             one_of("Settings.refine", self.refine, (True, False))
         if isinstance(self.refine, bool):
             object.__setattr__(self, "refine", Refinement() if self.refine else None)
+
+    def __repr__(self) -> str:
+        chosen = [f"{each.name}={getattr(self, each.name)!r}" for each in fields(self)]
+        usual = [f"{each.name}={each.default!r}" for each in fields(self)]
+        return f"Settings({', '.join(x for x, default in zip(chosen, usual, strict=True) if x != default)})"
 
 
 def as_record(name: str, choice: Any, known: dict[str, Any]) -> Any:

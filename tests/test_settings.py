@@ -110,6 +110,13 @@ def test_jax_may_put_anything_in_the_place_of_a_number():
     assert check_settings(jax.tree.map(jnp.asarray, settings)) is None
 
 
+def test_what_is_shown_is_what_was_chosen():
+    assert repr(tj.Settings()) == "Settings()"
+    chosen = tj.Settings(clique="greedy", rotation=Gnc(factor=2), refine=False)
+    assert eval(repr(chosen), {**vars(tj.settings), "Settings": tj.Settings}) == chosen
+    assert repr(chosen).startswith("Settings(clique=GreedyClique(), rotation=Gnc(factor=2.0, ")
+
+
 def test_settings_stay_as_they_are():
     with pytest.raises(dataclasses.FrozenInstanceError):
         tj.Settings().clique = "greedy"
