@@ -125,7 +125,7 @@ def read_problem(
         )
     n = src.shape[0]
     if dtype is None:
-        with jax.numpy_dtype_promotion("standard"):  # a user's clouds may be of two kinds, whatever JAX is set to
+        with jax.numpy_dtype_promotion("standard"):  # clouds may be of two kinds, whatever JAX is set to
             dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
     noise_bound = reading.one_a_match(noise_bound, "noise_bound", n)
     confidence = np.ones(n) if confidence is None else reading.one_a_match(confidence, "confidence", n)

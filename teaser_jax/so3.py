@@ -122,7 +122,8 @@ def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
     eye = jnp.eye(3, dtype=dtype)
     tiny = jnp.finfo(dtype).tiny
 
-    def turn(_: Int[Array, ""], rows: Float[Array, "3 6"]) -> Float[Array, "3 6"]:  # row k holds column k of A and of V: both turn alike
+    # Row k holds column k of A and of V: both turn alike.
+    def turn(_: Int[Array, ""], rows: Float[Array, "3 6"]) -> Float[Array, "3 6"]:
         x, y = rows[0], rows[1]
         xx, yy, xy = (_inner(u[:3], v[:3]) for u, v in ((x, x), (y, y), (x, y)))
         done = jnp.abs(xy) <= 8 * tiny

@@ -12,7 +12,7 @@ import pytest
 
 # Numba reads the source of these loops itself: they are loaded before anything is wrapped.
 import teaser_jax.stages.clique.branching
-import teaser_jax.stages.clique.reduction  # noqa: F401
+import teaser_jax.stages.clique.reduction
 
 # Annotations are checked whenever a function is called or a record made: in what is imported from here on.
 jaxtyping.install_import_hook("teaser_jax", "typechecker.checked")

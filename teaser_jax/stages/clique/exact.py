@@ -233,7 +233,7 @@ class _Search:
         for root in np.argsort(-bounds, kind="stable"):
             if self.lower_upper(int(bounds[root])):
                 return
-            self.branch_root(root)
+            self.branch_root(int(root))
             bounds[root] = 0
         self.lower_upper(0)
 

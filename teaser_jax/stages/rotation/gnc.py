@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from teaser_jax import so3
+from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.ground.numbers import Number, count, number, settle
 from teaser_jax.stages.rotation.tims import Rotation, Tims, Weigh
@@ -40,7 +41,7 @@ class Gnc:
         settle(self)
 
 
-def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: Float[Array, ""], dtype: Any) -> Rotation:
+def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: float | Float[AnyArray, ""], dtype: Any) -> Rotation:
     """The rotation that GNC-TLS ends at, and the TIMs that agree with it.
 
     The first fit uses all TIMs; if all agree with it, it is final. Otherwise they are weighed by
