@@ -42,10 +42,10 @@ class Listed:
         self.rows = self.columns[0].shape[0]
 
     def row(self, k):
-        return [jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in self.columns]
+        return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in self.columns)
 
     def recall(self, k, i):
-        return [x[k, i] for x in self.columns]
+        return tuple(x[k, i] for x in self.columns)
 
 
 @jax.jit
@@ -181,7 +181,7 @@ def test_the_scale_of_all_pairs_is_that_of_the_sweep(few_bins, monkeypatch, dtyp
 
     def estimated():
         one = jnp.ones((), dtype)
-        return jax.jit(lambda *x: scale.estimate_scale(*x, np.ones(n, bool), cbar2=one))(*args)
+        return jax.jit(lambda *x: scale.estimate_scale(*x, jnp.ones(n, bool), cbar2=one))(*args)
 
     monkeypatch.setattr(scale, "FEW_PAIRS", 0)
     found, pairs = estimated()

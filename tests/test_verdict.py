@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -110,7 +111,7 @@ def test_inliers_that_huddle_count_as_chance(x64):
     src = np.concatenate([0.01 * cloud(40), 5 + cloud(24)])
     problem = tj.make_problem(src, src, noise_bound=BOUND)
     pose = tj.Pose(np.eye(3), np.zeros(3), np.ones(()))
-    counts = np.asarray(verdict.chance_inliers(problem, pose, np.arange(n) < 40))
+    counts = np.asarray(verdict.chance_inliers(problem, pose, jnp.arange(n) < 40))
     assert counts.min() == 39
 
 
