@@ -52,7 +52,7 @@ class SoftSolution:
     solution: Solution
 
     @property
-    def ok(self) -> Bool[AnyArray, ""]:
+    def ok(self) -> Bool[AnyArray, "..."]:
         """Whether the pose can be trusted."""
         return self.status == Status.OK
 

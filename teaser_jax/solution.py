@@ -101,7 +101,7 @@ class Solution:
     cost: Float[AnyArray, "..."] | Placeholder
 
     @property
-    def ok(self) -> Bool[AnyArray, ""]:
+    def ok(self) -> Bool[AnyArray, "..."]:
         """Whether the pose can be trusted. A proof elsewhere never turns this true."""
         return self.status == Status.OK
 

@@ -40,10 +40,10 @@ class Listed:
         self.rows = self.columns[0].shape[0]
 
     def row(self, k):
-        return [jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in self.columns]
+        return tuple(jax.lax.dynamic_index_in_dim(x, k, keepdims=False) for x in self.columns)
 
     def recall(self, k, i):
-        return [x[k, i] for x in self.columns]
+        return tuple(x[k, i] for x in self.columns)
 
 
 def by_histogram(*args):

@@ -26,7 +26,8 @@ def fit(src, dst, weights, scale=None):
 
 @partial(jax.jit, static_argnames="iterations")
 def descend(pose, src, dst, bounds, mask, scale=ONE, iterations=50):
-    return refine(pose, src, dst, bounds, mask, scale=scale, cbar2=ONE, iterations=iterations)
+    scale = None if scale is None else jnp.asarray(scale)
+    return refine(pose, src, dst, bounds, mask, scale=scale, cbar2=jnp.asarray(ONE), iterations=iterations)
 
 
 def umeyama(src, dst, weights, scale=None) -> tj.Pose:

@@ -165,7 +165,7 @@ def test_read_out_is_the_weighted_mean_of_the_chosen(given):
     members = np.abs(values - float(scale)) <= alpha
     weight = confidence[pairs[:, 0]] * confidence[pairs[:, 1]] * members / alpha**2
     read = scale_of_pairs(
-        *map(jnp.asarray, (src, dst, bounds, confidence)), chosen, pairs=pairs if given else None
+        *map(jnp.asarray, (src, dst, bounds, confidence)), chosen, pairs=jnp.asarray(pairs) if given else None
     )
     assert float(read) == pytest.approx(np.sum(weight * values) / np.sum(weight), rel=1e-12)
 
@@ -174,7 +174,7 @@ def test_read_out_is_the_weighted_mean_of_the_chosen(given):
 def test_gradient_of_the_read_out_is_the_central_difference(given):
     n = 12
     src, dst, bounds, mask = inputs(random_matches(8, n, wrong=0.3, scale=1.3))
-    pairs = all_pairs(n) if given else None
+    pairs = jnp.asarray(all_pairs(n)) if given else None
     _, chosen = estimate(src, dst, bounds, mask, pairs=pairs)
     read = jax.jit(lambda *x: scale_of_pairs(*x, chosen, pairs=pairs))
     point = tuple(map(jnp.asarray, (src, dst, bounds, np.full(n, 0.7))))
@@ -187,11 +187,9 @@ def test_gradient_of_the_read_out_is_the_central_difference(given):
 
 
 def test_no_choice_reads_as_zero_with_finite_gradient():
-    src, dst, bounds, _ = inputs(random_matches(8, 12))
+    src, dst, bounds, _ = map(jnp.asarray, inputs(random_matches(8, 12)))
     nothing = jnp.zeros((12, 1), jnp.uint32)
-    value, slope = jax.value_and_grad(lambda s: scale_of_pairs(s, dst, bounds, jnp.ones(12), nothing))(
-        jnp.asarray(src)
-    )
+    value, slope = jax.value_and_grad(lambda s: scale_of_pairs(s, dst, bounds, jnp.ones(12), nothing))(src)
     assert value == 0
     assert np.all(np.asarray(slope) == 0)
 

@@ -57,7 +57,7 @@ def test_shifting_the_offsets_shifts_the_answer():
     offsets, bounds, mask = offsets_of(4)
     plain, members = estimate(offsets, bounds, mask)
     moved, same = estimate(offsets + np.array([1.0, 2.0, 3.0]), bounds, mask)
-    np.testing.assert_allclose(moved, plain + np.array([1, 2, 3]), atol=1e-12)
+    np.testing.assert_allclose(moved, plain + np.array([1.0, 2.0, 3.0]), atol=1e-12)
     np.testing.assert_array_equal(same, members)
 
 
@@ -104,7 +104,7 @@ def test_an_axis_without_points_reads_as_zero_with_finite_gradient():
 def test_gradient_of_the_read_out_is_the_central_difference():
     offsets, bounds, mask = offsets_of(9)
     _, members = estimate(offsets, bounds, mask)
-    read = jax.jit(lambda *x: jnp.sum(translation_of_points(*x, members) * jnp.array([1, 2, 3])))
+    read = jax.jit(lambda *x: jnp.sum(translation_of_points(*x, members) * jnp.array([1.0, 2.0, 3.0])))
     point = (offsets, bounds, np.full(N, 0.7))
     direction = tuple(np.random.default_rng(1).normal(size=x.shape) for x in point)
     ahead, behind = (

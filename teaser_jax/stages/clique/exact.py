@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32, UInt64
 
 from teaser_jax.ground.arrays import AnyArray
-from teaser_jax.ground.numbers import count, number, settle
+from teaser_jax.ground.numbers import TracedNumber, count, number, settle
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.greedy import DROPPED_SHARE, greedy_clique
 from teaser_jax.stages.clique.oracle import networkx_clique
@@ -50,8 +50,8 @@ class ExactClique:
         seconds: Budget of time [s]; traced. Compiling the search is not counted.
     """
 
-    nodes: int | AnyArray = count(100_000_000, traced=True)
-    seconds: float | AnyArray = number(60.0, least=0, infinite=True)
+    nodes: TracedNumber = count(100_000_000, traced=True)
+    seconds: TracedNumber = number(60.0, least=0, infinite=True)
     needs_host: ClassVar[bool] = True
     prunes: ClassVar[bool] = True
 
@@ -170,7 +170,7 @@ class _Search:
             self.keep(np.flatnonzero(alive))
 
     def order(self) -> None:
-        """Number the vertices by degeneracy, largest cores first, and take the bound that gives."""
+        """TracedNumber the vertices by degeneracy, largest cores first, and take the bound that gives."""
         order, core = self.reduction.degeneracy_order(self.rows)
         self.keep(np.ascontiguousarray(order[::-1]))
         self.lower_upper(int(core.max()) + 1)
@@ -233,7 +233,7 @@ class _Search:
         for root in np.argsort(-bounds, kind="stable"):
             if self.lower_upper(int(bounds[root])):
                 return
-            self.branch_root(root)
+            self.branch_root(int(root))
             bounds[root] = 0
         self.lower_upper(0)
 

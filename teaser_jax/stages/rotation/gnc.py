@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.loops import until_settled
-from teaser_jax.ground.numbers import count, number, settle
+from teaser_jax.ground.numbers import TracedNumber, count, number, settle
 from teaser_jax.stages.rotation.tims import Rotation, Tims, Weigh
 
 
@@ -32,8 +32,8 @@ class Gnc:
         iterations: Cap on the rounds; static.
     """
 
-    factor: float | AnyArray = number(1.4, above=1)
-    tolerance: float | AnyArray = number(1e-6, least=0)
+    factor: TracedNumber = number(1.4, above=1)
+    tolerance: TracedNumber = number(1e-6, least=0)
     iterations: int = count(100)
     needs_host: ClassVar[bool] = False
 
@@ -41,7 +41,7 @@ class Gnc:
         settle(self)
 
 
-def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: Float[Array, ""], dtype: Any) -> Rotation:
+def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: float | Float[AnyArray, ""], dtype: Any) -> Rotation:
     """The rotation that GNC-TLS ends at, and the TIMs that agree with it.
 
     The first fit uses all TIMs; if all agree with it, it is final. Otherwise they are weighed by
