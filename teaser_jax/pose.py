@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 class Pose:
     """The similarity ``b = s R a + t`` from the source to the target frame, ``T_dst_src``.
 
-    Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind.
+    Fields may be numpy or JAX arrays, with leading batch axes; results are of the same kind. As a Jacobian it
+    has the axes of the input behind its own.
     """
 
-    rotation: Float[AnyArray, "... 3 3"] | Placeholder
-    translation: Float[AnyArray, "... 3"] | Placeholder
+    rotation: Float[AnyArray, "... 3 3"] | Float[AnyArray, "3 3 ..."] | Placeholder
+    translation: Float[AnyArray, "... 3"] | Float[AnyArray, "3 ..."] | Placeholder
     scale: Float[AnyArray, "..."] | Placeholder
 
     @classmethod
@@ -55,7 +56,7 @@ class Pose:
         """Unit quaternion of the rotation, scalar last."""
         return so3.quat_from_rotation(self.rotation)
 
-    def apply(self, points: Float[AnyArray, "*batch n 3"]) -> Float[AnyArray, "*batch n 3"]:
+    def apply(self, points: Float[AnyArray, "... n 3"]) -> Float[AnyArray, "... n 3"]:
         """Source points (rows) in the target frame. Raises ValueError on other shapes than (..., n, 3)."""
         if points.ndim < 2 or points.shape[-1] != 3:
             raise ValueError(f"points have shape {points.shape}: expected (n, 3), one point a row.")

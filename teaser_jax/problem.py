@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -125,7 +125,8 @@ def read_problem(
         )
     n = src.shape[0]
     if dtype is None:
-        dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
+        with jax.numpy_dtype_promotion("standard"):  # a user's clouds may be of two kinds, whatever JAX is set to
+            dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
     noise_bound = reading.one_a_match(noise_bound, "noise_bound", n)
     confidence = np.ones(n) if confidence is None else reading.one_a_match(confidence, "confidence", n)
     mask = np.ones(n, bool) if mask is None else reading.truth_values(mask, n)
@@ -145,7 +146,7 @@ def read_problem(
     )
 
 
-def stack_problems(problems: Sequence[Problem]) -> Problem:
+def stack_problems(problems: Iterable[Problem]) -> Problem:
     """Problems of any sizes as one batch: padded to the largest, padding masked.
 
     Numpy arrays stay numpy. Gradients: exact.

@@ -40,8 +40,8 @@ class Uncertainty:
         convention: Which coordinates, as asked for.
     """
 
-    covariance: Float[AnyArray, "... d d"] | Placeholder
-    information: Float[AnyArray, "... d d"] | Placeholder
+    covariance: Float[AnyArray, "... d d"] | Float[AnyArray, "d d ..."] | Placeholder
+    information: Float[AnyArray, "... d d"] | Float[AnyArray, "d d ..."] | Placeholder
     convention: Convention = field(metadata={"static": True})
 
 

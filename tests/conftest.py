@@ -18,9 +18,20 @@ if not os.environ.get("TEASER_JAX_OPTIMIZED"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
 
 import jax
+import jaxtyping
 import pytest
 
-import teaser_jax as tj
+# Numba reads the source of these loops itself: they are loaded before anything is wrapped.
+import teaser_jax.stages.clique.branching
+import teaser_jax.stages.clique.reduction  # noqa: F401
+
+# Annotations are checked whenever a function is called or a record made: in what is imported from here on.
+jaxtyping.install_import_hook("teaser_jax", "typechecker.checked")
+# No axis and no kind of number may be added in silence, neither by the package nor by a test.
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+import teaser_jax as tj  # noqa: E402
 
 # Warnings are errors from the collection on: not in pyproject.toml, where a plugin of another package that
 # warns while pytest starts would stop it. Later lines win.
@@ -51,6 +62,14 @@ def x64() -> Iterator[None]:
     """JAX in float64 for one test; the default, float32, is what most users have."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def unchecked() -> Iterator[None]:
+    """For calls that break the annotations on purpose: the words of the package must say what is wrong."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture(scope="session")

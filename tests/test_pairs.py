@@ -101,7 +101,7 @@ def test_fold_meets_each_ordered_pair_of_usable_matches_once(n):
     mask = rng.uniform(size=n) < 0.8
 
     def mark(met, lane, visited):
-        columns = jnp.arange(bits.words(n)) * 32 + lane
+        columns = jnp.arange(bits.words(n), dtype=jnp.int32) * 32 + lane
         return met.at[:, columns].add(jnp.where(visited.valid, 1, 0), mode="drop")
 
     met = pairs_room.fold_pairs(
@@ -116,7 +116,7 @@ def test_fold_hands_out_the_tims_and_bounds_of_the_dense_graph(n):
     src, dst, beta = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.uniform(1, 2, n)
 
     def collect(dense, lane, visited):
-        columns = jnp.arange(bits.words(n)) * 32 + lane
+        columns = jnp.arange(bits.words(n), dtype=jnp.int32) * 32 + lane
         layers = [*visited.src_tims, *visited.dst_tims, visited.bounds]
         return dense.at[:, :, columns].set(jnp.where(visited.valid, jnp.stack(layers), 0), mode="drop")
 
@@ -150,8 +150,8 @@ def test_gradient_through_the_fold_is_the_dense_one(n):
 
     def dense(src, dst, beta):
         square = lambda x: jnp.sum((x[:, None] - x[None]) ** 2, axis=-1)
-        valid = mask[:, None] & mask & ~jnp.eye(n, dtype=bool)
-        return jnp.sum(jnp.where(valid, term(square(src), square(dst), beta[:, None] + beta), 0))
+        valid = mask[:, None] & mask[None] & ~jnp.eye(n, dtype=bool)
+        return jnp.sum(jnp.where(valid, term(square(src), square(dst), beta[:, None] + beta[None]), 0))
 
     found, expected = (jax.jit(jax.value_and_grad(f, argnums=(0, 1, 2)))(*inputs) for f in (folded, dense))
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-13)

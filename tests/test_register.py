@@ -317,7 +317,7 @@ def test_on_constants_inside_jit_it_names_the_function_to_use_too(problem):
         lambda: tj.Settings(refine=3),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(problem, settings):
+def test_settings_that_make_no_sense_are_refused(problem, settings, unchecked):
     for call in (tj.register, tj.profile):
         with pytest.raises(
             ValueError, match=r"(settings|Settings|Gnc|ExactClique|ScaleVote)\b.* is .*expected"

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax.engine.sizes import Size
-from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.ground.arrays import AnyArray, Placeholder
 from teaser_jax.problem import Problem
 from teaser_jax.settings import Settings
 
@@ -36,9 +36,9 @@ class PackedProblem:
         scale_is_known: Whether the scale is one of the numbers; static.
     """
 
-    columns: Float[AnyArray, "*batch 9 n"]
-    numbers: Float[AnyArray, "*batch c"]
-    pairs: Int[AnyArray, "*batch m 2"] | None
+    columns: Float[AnyArray, "... 9 n"] | Placeholder
+    numbers: Float[AnyArray, "... c"] | Placeholder
+    pairs: Int[AnyArray, "... m 2"] | Placeholder | None
     scale_is_known: bool = field(metadata={"static": True})
 
     @property
@@ -146,13 +146,13 @@ class Packed:
 
     Attributes:
         numbers: Its small leaves one after the other, counts and flags too; exact in float64.
-        masks: Its masks side by side, an array for each number of rows.
+        masks: Its masks side by side, (..., n, k), an array for each number of rows n.
         others: The leaves that travel by themselves.
         layout: How to put the record together again; static.
     """
 
-    numbers: Float[AnyArray, "*batch c"]
-    masks: tuple[Bool[AnyArray, "*batch n k"], ...]
+    numbers: Float[AnyArray, "... c"] | Placeholder
+    masks: tuple[Bool[AnyArray, "... _ _"] | Placeholder, ...]
     others: tuple[AnyArray, ...]
     layout: Layout = field(metadata={"static": True})
 

@@ -21,14 +21,16 @@ else:
 
     class _MayStandForAnArray(type):
         def __instancecheck__(cls, value: object) -> bool:
-            is_array = hasattr(value, "shape") and hasattr(value, "dtype")
-            return not is_array or value.dtype == jax.dtypes.float0
+            if not (hasattr(value, "shape") and hasattr(value, "dtype")):
+                return True
+            return value.dtype == jax.dtypes.float0 or (value.dtype == bool and value.shape == ())
 
     class Placeholder(metaclass=_MayStandForAnArray):
-        """What a record may hold in the place of an array: JAX rebuilds records from other things, too.
+        """What a record may hold where an array is meant: JAX rebuilds records from other things, too.
 
-        That is an axis of ``vmap``, a sharding, whatever ``jax.tree.map`` returned, and the tangents of truth
-        values, which have no numbers. Shapes without numbers (``jax.ShapeDtypeStruct``) pass for arrays.
+        That is an axis of ``vmap``, a sharding, whatever no array ``jax.tree.map`` returned, its answer to a
+        question about each array (one truth value), and the tangents of truth values, which have no numbers.
+        Shapes without numbers (``jax.ShapeDtypeStruct``) pass for arrays.
         """
 
 

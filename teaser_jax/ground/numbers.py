@@ -10,12 +10,16 @@ from __future__ import annotations
 
 from dataclasses import Field, dataclass, field, fields
 from numbers import Real
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from jaxtyping import Num
 
-from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
 from teaser_jax.ground.checks import whole_number
+
+# What a traced field holds: a number that is known, or an array of one; with the axes of a batch, of many.
+Number: TypeAlias = float | Num[AnyArray, "..."] | Placeholder
 
 RULE = "rule"
 

@@ -12,7 +12,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.ground import bits
-from teaser_jax.ground.arrays import is_traced, safe_norm, safe_sqrt
+from teaser_jax.ground.arrays import Placeholder, is_traced, safe_norm, safe_sqrt
+from teaser_jax.ground.numbers import Number
 from teaser_jax.stages.pairs import (
     PairSlice,
     fold_pairs,
@@ -27,7 +28,6 @@ from teaser_jax.stages.vote.sweep import Criterion, vote
 
 FEW_PAIRS = 32768  # that a sweep over all ends decides sooner than histograms
 ScalePairs: TypeAlias = UInt32[Array, "n w"] | Bool[Array, " m"]
-Limit: TypeAlias = float | Float[Array, ""]
 
 
 @jax.tree_util.register_dataclass
@@ -40,7 +40,7 @@ class ScaleVote:
             a hundred; an answer further away has no consensus.
     """
 
-    range: tuple[Limit, Limit] = field(default=(0.0, float("inf")))
+    range: tuple[Number, Number] | Placeholder = field(default=(0.0, float("inf")))
 
     def __post_init__(self) -> None:
         if not isinstance(self.range, tuple) or len(self.range) != 2:

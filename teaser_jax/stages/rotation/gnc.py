@@ -15,9 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.loops import until_settled
-from teaser_jax.ground.numbers import count, number, settle
+from teaser_jax.ground.numbers import Number, count, number, settle
 from teaser_jax.stages.rotation.tims import Rotation, Tims, Weigh
 
 
@@ -32,8 +31,8 @@ class Gnc:
         iterations: Cap on the rounds; static.
     """
 
-    factor: float | AnyArray = number(1.4, above=1)
-    tolerance: float | AnyArray = number(1e-6, least=0)
+    factor: Number = number(1.4, above=1)
+    tolerance: Number = number(1e-6, least=0)
     iterations: int = count(100)
     needs_host: ClassVar[bool] = False
 
