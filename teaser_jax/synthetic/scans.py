@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Real
 
 from teaser_jax.ground.arrays import Number
 from teaser_jax.pose import Pose
@@ -37,7 +37,7 @@ class ScanPair:
 
 def scan_pair(
     seed: Seed,
-    model: Points,
+    model: Real[np.ndarray, "m 3"],
     *,
     n: int = 640,
     sigma: Number = 0.005,
@@ -75,7 +75,7 @@ def scan_pair(
 
 
 def partial_scan(
-    seed: Seed | np.random.Generator, model: Points, view: Vector, *, n: int, sigma: Number, cells: int = 40
+    seed: Seed | np.random.Generator, model: Real[np.ndarray, "m 3"], view: Vector, *, n: int, sigma: Number, cells: int = 40
 ) -> Points:
     """Scan the side of a model that is seen from a direction, with Gaussian noise.
 
