@@ -26,7 +26,7 @@ from teaser_jax.certify.host_measurements import HostMeasurements, read_measurem
 from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.relaxation import relaxed_rotation
 from teaser_jax.certify.traced import certify_traced, traced_mask
-from teaser_jax.ground.arrays import AnyArray, is_traced
+from teaser_jax.ground.arrays import AnyArray, Placeholder, at_least_float32, is_traced
 from teaser_jax.ground.checks import one_of
 from teaser_jax.settings import ROTATIONS, RotationMethod, as_record, check_record
 from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
@@ -49,9 +49,9 @@ class RotationSolution:
         relaxation: What the conic solver said, for ``method="sdp"``.
     """
 
-    rotation: Float[AnyArray, "*batch 3 3"]
-    inliers: Bool[AnyArray, "*batch k"]
-    cost: Float[AnyArray, "*batch"]
+    rotation: Float[AnyArray, "... 3 3"] | Placeholder
+    inliers: Bool[AnyArray, "... k"] | Placeholder
+    cost: Float[AnyArray, "..."] | Placeholder
     certificate: Certificate | None = None
     relaxation: RelaxationReport | None = field(default=None, metadata=dict(static=True))
 
@@ -74,7 +74,7 @@ def solve_rotation(
     mask: Any = None,
     proof: CertifyMethod | None = "splitting",
     tolerance: Any = TOLERANCE,
-    iterations: int | None = None,
+    iterations: int | np.integer | None = None,
 ) -> RotationSolution:
     """Find the rotation behind vector pairs ``dst_k ~ R src_k``, many of them wrong, and prove what can be.
 
@@ -137,8 +137,7 @@ def _traced(
     # Rows of zeros that are masked: programs want something to look at.
     grown = (0, max(0, 2 - k))
     mask = jnp.pad(traced_mask(mask, (k,)), grown)
-    src, dst = (jnp.pad(jnp.asarray(x), (grown, (0, 0))) for x in (src, dst))
-    src, dst = (x.astype(jnp.promote_types(x.dtype, jnp.float32)) for x in (src, dst))
+    src, dst = (jnp.pad(at_least_float32(x), (grown, (0, 0))) for x in (src, dst))
     noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
     src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
     found = _search(src, dst, noise_bound, cbar2, mask, _gnc_of(method), all_pairs=_tries_pairs(method))

@@ -258,7 +258,7 @@ def test_numbers_of_all_kinds_under_jit():
         (dict(src=np.ones((2, 12, 3)), dst=np.ones((2, 12, 3)), noise_bound=np.ones(12)), "stack of 2"),
     ],
 )
-def test_odd_parameters_are_refused(change, words):
+def test_odd_parameters_are_refused(unchecked, change, words):
     src, dst, rotation = draw_vectors(0, 12, 0.0)
     known = dict(src=src, dst=dst, rotation=rotation, noise_bound=BOUND) | change
     with pytest.raises(ValueError, match=words):

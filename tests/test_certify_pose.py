@@ -52,8 +52,11 @@ def test_certify_under_jit_and_too_large():
         small = jax.jit(lambda p, s: tj.certify(p, s, max_measurements=8))(problem, solution)
         assert int(small.status) == CertificateStatus.TOO_LARGE
         assert not bool(small.is_optimal)
+
+
+def test_an_unknown_subject_is_refused(unchecked):
     with pytest.raises(ValueError, match="about"):
-        tj.certify(problem, solution, about="everything")
+        tj.certify(None, None, about="everything")
 
 
 def test_a_result_computes_its_certificate_when_asked(small):

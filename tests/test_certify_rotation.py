@@ -209,7 +209,7 @@ def test_under_jit_and_vmap_it_says_the_same():
         (dict(mask=np.ones(3, bool)), "mask"),
     ],
 )
-def test_bad_input_is_refused(change, words):
+def test_bad_input_is_refused(unchecked, change, words):
     src, dst, rotation = draw_vectors(0, 12, 0.0)
     known = dict(src=src, dst=dst, rotation=rotation, noise_bound=BOUND) | change
     with pytest.raises(ValueError, match=words):

@@ -172,7 +172,7 @@ def test_keypoints_of_every_type_and_distance(kind, far):
     assert np.isfinite(jax.jit(jax.grad(loss))(dst.astype(np.float32))).all()
 
 
-def test_impossible_numbers_are_refused():
+def test_impossible_numbers_are_refused(unchecked):
     one = tj.Pose(np.eye(3), np.zeros(3), np.asarray(1.0))
     points, a = np.ones((4, 3), np.float32), unit_rows(0, 4)
     weights = np.full(4, 0.5, np.float32)

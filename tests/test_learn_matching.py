@@ -97,7 +97,7 @@ def test_descriptors_that_are_not_finite_match_nothing_and_spoil_no_gradient(x64
     assert np.all(np.isfinite(slope))
 
 
-def test_nonsense_is_refused():
+def test_nonsense_is_refused(unchecked):
     a, b = (jnp.asarray(x) for x in descriptors(7, 6, 8))
     for bad in ((a, b[:, :3]), (a, b[:0]), (a[None], b[None])):
         with pytest.raises(ValueError, match="expected"):

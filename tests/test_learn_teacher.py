@@ -59,7 +59,7 @@ def test_no_gradient_flows_into_labels(x64):
     np.testing.assert_array_equal(slope, 0)
 
 
-def test_shapes_that_do_not_fit_are_told():
+def test_shapes_that_do_not_fit_are_told(unchecked):
     with pytest.raises(ValueError, match="expected the same"):
         teacher(jnp.zeros((2, 5, 3)), jnp.zeros((2, 6, 3)), noise_bound=0.1)
     with pytest.raises(ValueError, match="expected the same"):

@@ -72,7 +72,7 @@ def origin_of(pair: synthetic.ScanPair) -> np.ndarray:
     return pair.dst.mean(axis=0)
 
 
-def test_nonsense_is_refused():
+def test_nonsense_is_refused(unchecked):
     for known, words in (
         ({"kinds": ("cube",)}, "cube"),
         ({"kinds": ()}, "nothing"),

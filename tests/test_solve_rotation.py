@@ -105,7 +105,7 @@ def test_few_measurements_give_an_answer_and_no_crash(k):
         (dict(proof="magic"), "proof is 'magic'"),
     ],
 )
-def test_bad_input_is_refused(change, words):
+def test_bad_input_is_refused(unchecked, change, words):
     src, dst, _ = draw_vectors(0, 12, 0.0)
     with pytest.raises(ValueError, match=words):
         tj.solve_rotation(**(dict(src=src, dst=dst, noise_bound=BOUND) | change))

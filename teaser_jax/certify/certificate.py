@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax.certify.dual import Dual
-from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.ground.arrays import AnyArray, Placeholder
 
 
 class CertificateStatus(enum.IntEnum):
@@ -92,22 +92,22 @@ class Certificate:
             clique.
     """
 
-    cost: Float[AnyArray, "*batch"]
-    lower_bound: Float[AnyArray, "*batch"]
-    suboptimality: Float[AnyArray, "*batch"]
-    absolute_gap: Float[AnyArray, "*batch"]
-    is_optimal: Bool[AnyArray, "*batch"]
-    is_unique: Bool[AnyArray, "*batch"]
-    angle_bound: Float[AnyArray, "*batch"]
-    measurements: Int[AnyArray, "*batch"]
-    iterations: Int[AnyArray, "*batch"]
-    method: Int[AnyArray, "*batch"]
-    status: Int[AnyArray, "*batch"]
-    rotation: Float[AnyArray, "*batch 3 3"]
-    angle: Float[AnyArray, "*batch"]
+    cost: Float[AnyArray, "..."] | Placeholder
+    lower_bound: Float[AnyArray, "..."] | Placeholder
+    suboptimality: Float[AnyArray, "..."] | Placeholder
+    absolute_gap: Float[AnyArray, "..."] | Placeholder
+    is_optimal: Bool[AnyArray, "..."] | Placeholder
+    is_unique: Bool[AnyArray, "..."] | Placeholder
+    angle_bound: Float[AnyArray, "..."] | Placeholder
+    measurements: Int[AnyArray, "..."] | Placeholder
+    iterations: Int[AnyArray, "..."] | Placeholder
+    method: Int[AnyArray, "..."] | Placeholder
+    status: Int[AnyArray, "..."] | Placeholder
+    rotation: Float[AnyArray, "... 3 3"] | Placeholder
+    angle: Float[AnyArray, "..."] | Placeholder
     dual: Dual
-    inlier_gap: Int[AnyArray, "*batch"] | None = None
-    explained_gap: Float[AnyArray, "*batch"] | None = None
+    inlier_gap: Int[AnyArray, "..."] | Placeholder | None = None
+    explained_gap: Float[AnyArray, "..."] | Placeholder | None = None
 
     def __repr__(self) -> str:
         if isinstance(self.status, jax.core.Tracer) or np.shape(self.status) != ():

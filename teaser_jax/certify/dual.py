@@ -32,8 +32,8 @@ class Dual(NamedTuple):
         diagonal: Blocks (k, k) of the measurements, symmetric. Block (0, 0) is minus their sum.
     """
 
-    skew: Float[AnyArray, "*batch n n 6"]
-    diagonal: Float[AnyArray, "*batch k 4 4"]
+    skew: Float[AnyArray, "... n n 6"]
+    diagonal: Float[AnyArray, "... k 4 4"]
 
 
 def existing(m: Measurements) -> Float[Array, " n"]:
@@ -77,7 +77,7 @@ def reference_guess(m: Measurements) -> Dual:
     plus, minus = cost_blocks(m)
     r2 = jnp.where(m.inliers, jnp.sum(m.residuals**2, axis=1), 0)
     eye = jnp.eye(3, dtype=m.src.dtype)
-    top = 0.5 * plus[:, :3, :3] - 0.5 * r2[:, None, None] * eye
+    top = 0.5 * plus[:, :3, :3] - 0.5 * r2[:, None, None] * eye[None]
     return Dual(_no_coupling(m), _with_last_column(m, top, minus) - plus)
 
 
@@ -134,7 +134,7 @@ def _coupling(m: Measurements) -> Float[Array, "k k 3"]:
     reduced = jnp.matmul(a, inverse, precision=HIGHEST)
     along = jnp.sum(reduced * a, axis=1)
     along = jnp.where(along > jnp.finfo(a.dtype).tiny, along, 1)
-    project = inverse - reduced[:, :, None] * reduced[:, None, :] / along[:, None, None]
+    project = inverse[None] - reduced[:, :, None] * reduced[:, None, :] / along[:, None, None]
     project = project * inlier[:, :, None]
     # N^T + sum_k project_k N a_k a_k^T = sum_k project_k xi_k a_k^T / 2, for N as a vector of nine.
     system = jnp.einsum("kip,kq,kj->ijpq", project, a, a, precision=HIGHEST)
@@ -166,4 +166,4 @@ def _outlier_correction(m: Measurements) -> Float[Array, "k 3 3"]:
     shape = bisector[:, :, None] * bisector[:, None, :]
     shape += normal[:, :, None] * normal[:, None, :] / sine2[:, None, None]
     good = m.mask & ~m.inliers & some_a & some_b & some_n & some_p
-    return jnp.where(good[:, None, None], 0.5 * m.cbar2 * (shape - eye), 0)
+    return jnp.where(good[:, None, None], 0.5 * m.cbar2 * (shape - eye[None]), 0)

@@ -56,7 +56,11 @@ class ErrorBounds:
 
 
 def error_bounds(
-    problem: Problem, solution: Solution, *, wrong: int = 0, certificate: Certificate | None = None
+    problem: Problem,
+    solution: Solution,
+    *,
+    wrong: int | np.integer = 0,
+    certificate: Certificate | None = None,
 ) -> ErrorBounds:
     """Bound the error of a pose, and say what each bound rests on.
 
@@ -78,7 +82,7 @@ def error_bounds(
     """
     if is_traced(problem, solution) or np.ndim(solution.status) != 0:
         raise ValueError("error_bounds takes one problem and runs outside jit: give it the items one by one.")
-    whole_number("wrong", wrong, 0, what="the number of inliers that may be wrong")
+    wrong = whole_number("wrong", wrong, 0, what="the number of inliers that may be wrong")
     p, s = on_host((problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
     with jax.enable_x64(True):

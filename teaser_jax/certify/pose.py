@@ -34,8 +34,8 @@ def certify(
     *,
     about: About = "pose",
     tolerance: Any = TOLERANCE,
-    iterations: int | None = None,
-    max_measurements: int | None = None,
+    iterations: int | np.integer | None = None,
+    max_measurements: int | np.integer | None = None,
     method: CertifyMethod = "splitting",
 ) -> Certificate:
     """Prove how good the answer to a registration problem is, *given these measurements*.
@@ -157,9 +157,9 @@ def with_gaps(found: Certificate, problem: Problem, solution: Solution) -> Certi
     p = problem
     xp = namespace(p.src, solution.clique_upper_bound)
     most = xp.asarray(solution.clique_upper_bound)
-    gap = most - xp.sum(solution.inliers)
-    unexplained = (xp.sum(_usable(p)) - most) * p.cbar2
-    explained_gap = (solution.cost - unexplained) / (xp.maximum(most, 1) * p.cbar2)
+    gap = most - xp.sum(solution.inliers, dtype=most.dtype)
+    unexplained = (xp.sum(_usable(p), dtype=most.dtype) - most).astype(p.cbar2.dtype) * p.cbar2
+    explained_gap = (solution.cost - unexplained) / (xp.maximum(most, 1).astype(p.cbar2.dtype) * p.cbar2)
     return replace(found, inlier_gap=gap.astype(np.int32), explained_gap=explained_gap)
 
 

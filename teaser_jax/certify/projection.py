@@ -20,21 +20,21 @@ def project_dual(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[
     """
     n = w.shape[0] // 4
     count, index = jnp.sum(exists), jnp.arange(n)
-    blocks = w.reshape(n, 4, n, 4) * (exists[:, None] * exists)[:, None, :, None]
+    blocks = w.reshape(n, 4, n, 4) * (exists[:, None] * exists[None])[:, None, :, None]
     diagonal = blocks[index, :, index, :]
 
     columns = blocks[:, :3, :, 3]  # u_ij at [i, :, j]
     anti = 0.5 * (columns - jnp.transpose(columns, (2, 1, 0)))
     g = (jnp.sum(anti, axis=2) + diagonal[:, :3, 3]) / (count + 2)
     y = anti - (g[:, :, None] - g.T[None, :, :])
-    y = y * (exists[:, None] * exists)[:, None, :]
+    y = y * (exists[:, None] * exists[None])[:, None, :]
     y = y.at[index, :, index].set(0)
     y = y.at[index, :, index].set(-jnp.sum(y, axis=2))
 
     top = blocks[:, :3, :, :3]
     top = 0.5 * (top - jnp.transpose(top, (0, 3, 2, 1)))
     mean = jnp.sum(diagonal[:, :3, :3], axis=0) / count
-    top = top.at[index, :, index, :].set((diagonal[:, :3, :3] - mean) * exists[:, None, None])
+    top = top.at[index, :, index, :].set((diagonal[:, :3, :3] - mean[None]) * exists[:, None, None])
 
     found = jnp.zeros_like(blocks)
     found = found.at[:, :3, :, :3].set(top)

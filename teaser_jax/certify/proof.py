@@ -63,9 +63,9 @@ def claim_of(m: Measurements, constant: Float[Array, ""], tolerance: Float[Array
     polished = m.turned(turn)
     given, best = m.cost + constant, polished.cost + constant
     # A hair less than the tolerance, so that the suboptimality does not read a hair more.
-    least = ABSOLUTE_TOLERANCE * m.cbar2
-    tolerated = jnp.maximum((1 - 1e-9) * tolerance * given, least) - (given - best)
-    aim = jnp.where(tolerated > 0, tolerated, jnp.maximum((1 - 1e-9) * tolerance * best, least))
+    share, least = jnp.asarray((1 - 1e-9) * tolerance, given.dtype), ABSOLUTE_TOLERANCE * m.cbar2
+    tolerated = jnp.maximum(share * given, least) - (given - best)
+    aim = jnp.where(tolerated > 0, tolerated, jnp.maximum(share * best, least))
     count = jnp.sum(m.mask).astype(given.dtype) + 1
     return Claim(polished, turn, given, best, tolerated > 0, aim / count)
 
@@ -98,7 +98,7 @@ def iterate(claim: Claim, attempt: Attempt, iterations: Int[Array, ""] | int) ->
 def as_published(claim: Claim, iterations: int) -> Attempt:
     """Run Algorithm 3, then test its best matrix once, as the other methods test theirs."""
     m = claim.polished
-    count = jnp.sum(m.mask) + 1
+    count = jnp.sum(m.mask, dtype=claim.shift.dtype) + 1
     tolerance = claim.shift * count / jnp.where(m.cost > 0, m.cost, 1)
     found = reference(m, tolerance=0.99 * tolerance, iterations=iterations)
     proved = reaches(m, found.matrix, claim.shift)
@@ -164,7 +164,7 @@ def read_off(
     lower = _lower_bound(claim, measured, lowest)
     lower = jnp.where(some, jnp.where(zero | ~known, 0, lower), claim.given)
     gap = claim.given - lower
-    everything = m.cbar2 * jnp.maximum(measured, 1)
+    everything = m.cbar2 * jnp.maximum(measured, 1).astype(m.cbar2.dtype)
     optimal = (attempt.proved | zero) & claim.possible & known
     unique, angle_bound = lax.cond(
         attempt.proved & optimal & some,

@@ -72,7 +72,7 @@ def turned_dual(m: Measurements, dual: Dual, turn: Float[Array, "3 3"]) -> Float
     nothing = Dual(jnp.zeros_like(dual.skew), jnp.zeros_like(dual.diagonal))
     delta = dual_matrix(m, dual) - dual_matrix(m, nothing)
     u, t = jnp.split(so3.quat_from_rotation(turn), [3])
-    left = jnp.block([[t * jnp.eye(3) + so3.hat(u), u[:, None]], [-u[None], t[None]]])
+    left = jnp.block([[t[None] * jnp.eye(3) + so3.hat(u), u[:, None]], [-u[None], t[None]]])
     signs = jnp.where(m.inliers == other.inliers, 1.0, -1.0)
     change = jnp.kron(jnp.diag(jnp.concatenate([jnp.ones(1), signs])), left)
     return dual_matrix(other, nothing) + change.T @ delta @ change

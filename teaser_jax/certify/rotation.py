@@ -30,9 +30,9 @@ def certify_rotation(
     cbar2: Any = 1.0,
     mask: Any = None,
     tolerance: Any = TOLERANCE,
-    iterations: int | None = None,
+    iterations: int | np.integer | None = None,
     method: CertifyMethod = "splitting",
-    max_measurements: int = MAX_MEASUREMENTS,
+    max_measurements: int | np.integer = MAX_MEASUREMENTS,
 ) -> Certificate:
     """Bound how much better than ``rotation`` any rotation could fit ``dst_k ~ R src_k``.
 

@@ -12,7 +12,7 @@ from teaser_jax.stages.rotation.quadratic_form import Measurements
 def project_semidefinite(w: Float[Array, "m m"]) -> Float[Array, "m m"]:
     """Project a symmetric matrix on the positive semidefinite ones: negative eigenvalues become zero."""
     values, vectors = jnp.linalg.eigh(w)
-    return jnp.matmul(vectors * jnp.maximum(values, 0), vectors.T, precision=lax.Precision.HIGHEST)
+    return jnp.matmul(vectors * jnp.maximum(values, 0)[None], vectors.T, precision=lax.Precision.HIGHEST)
 
 
 def smallest_eigenvalue(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) -> Float[Array, ""]:
@@ -33,7 +33,7 @@ def factorisation_error(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Float
     It is the backward error of the factorisation, (N + 2) eps trace, and that of making the matrix.
     """
     eps = jnp.finfo(matrix.dtype).eps
-    terms = jnp.sum(m.src**2) + jnp.sum(m.dst**2) + jnp.sum(m.mask) * m.cbar2
+    terms = jnp.sum(m.src**2) + jnp.sum(m.dst**2) + jnp.sum(m.mask, dtype=m.cbar2.dtype) * m.cbar2
     return eps * ((matrix.shape[0] + 2) * jnp.sum(jnp.abs(jnp.diagonal(matrix))) + 32 * terms)
 
 

@@ -52,7 +52,7 @@ def split(
     """
     exists = existing(m)
     scale = jnp.tile(jnp.array([VECTOR_SCALE] * 3 + [1.0], start.dtype), exists.shape[0])
-    first = start * scale[:, None] * scale
+    first = start * scale[:, None] * scale[None]
     margins = jnp.asarray(MARGINS, start.dtype) * m.cbar2 * VECTOR_SCALE**2
     across = _across(exists)
 
@@ -62,14 +62,14 @@ def split(
         rounds: Array
 
     def once(state: State) -> tuple[State, Array]:
-        inside = margins[jnp.sum(state.rounds >= jnp.array(UNTIL))] * across
+        inside = margins[jnp.sum(state.rounds >= jnp.array(UNTIL, jnp.int32))] * across
         cone = project_semidefinite(state.iterate - inside) + inside
         affine = first + project_dual(2 * cone - state.iterate - first, exists)
-        proved = reaches(m, affine / scale[:, None] / scale, shift)
+        proved = reaches(m, affine / scale[:, None] / scale[None], shift)
         return State(state.iterate + RELAXATION * (affine - cone), affine, state.rounds + 1), proved
 
     final, proved = until_settled(once, State(first, first, jnp.int32(0)), iterations=iterations)
-    return Split(final.affine / scale[:, None] / scale, proved, final.rounds)
+    return Split(final.affine / scale[:, None] / scale[None], proved, final.rounds)
 
 
 def _across(exists: Float[Array, " n"]) -> Float[Array, "n4 n4"]:

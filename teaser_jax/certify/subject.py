@@ -81,7 +81,7 @@ def _about_pose(problem: Problem, solution: Solution) -> Subject:
     weights = xp.where(keep & chosen.inliers, 1 / xp.where(keep, p.noise_bound, 1) ** 2, 0)
     total = xp.sum(weights)
     weights = weights / xp.where(total > 0, total, 1)
-    a, b = (x - xp.sum(weights[:, None] * x, axis=0) for x in (src, dst))
+    a, b = (x - xp.sum(weights[:, None] * x, axis=0)[None] for x in (src, dst))
     return Subject(solution.pose.scale * a, b, p.noise_bound, keep, solution.pose.rotation)
 
 

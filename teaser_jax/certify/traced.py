@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.options import Options
 from teaser_jax.certify.proof import prove
+from teaser_jax.ground.arrays import float32_or_wider
 from teaser_jax.stages.rotation.quadratic_form import in_frame_of
 
 
@@ -40,7 +41,7 @@ def certify_traced(
     k, most = len(src), options.max_measurements
     if k > most:
         raise ValueError(f"{k} measurements are more than max_measurements, {most}.")
-    dtype = jnp.promote_types(jnp.result_type(src), jnp.float32)
+    dtype = float32_or_wider(jnp.result_type(src))
     mask = traced_mask(mask, (k,))
     src, dst, rotation, noise_bound, cbar2 = lax.stop_gradient((src, dst, rotation, noise_bound, cbar2))
     with jax.enable_x64(True):

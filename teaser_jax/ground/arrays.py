@@ -96,7 +96,7 @@ def squared_distances(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[A
 
     Gradients: exact.
     """
-    return jnp.sum(a * a, axis=1)[:, None] + jnp.sum(b * b, axis=1) - 2 * inner_products(a, b)
+    return jnp.sum(a * a, axis=1)[:, None] + jnp.sum(b * b, axis=1)[None] - 2 * inner_products(a, b)
 
 
 def at_least_float32(values: AnyArray) -> Float[Array, "..."]:
@@ -110,7 +110,13 @@ def at_least_float32(values: AnyArray) -> Float[Array, "..."]:
     values = jnp.asarray(values)
     if jnp.issubdtype(values.dtype, jnp.complexfloating):
         raise ValueError("complex numbers were received: points are real.")
-    return values.astype(jnp.promote_types(values.dtype, jnp.float32))
+    return values.astype(float32_or_wider(values.dtype))
+
+
+def float32_or_wider(dtype: Any) -> np.dtype:
+    """Choose the kind of number to compute in for values of a kind: their own, or float32 where it is wider."""
+    with jax.numpy_dtype_promotion("standard"):  # whatever JAX is set to: nothing is mixed in silence here
+        return jnp.promote_types(dtype, jnp.float32)
 
 
 def as_numpy(value: Any, name: str) -> np.ndarray:

@@ -47,7 +47,7 @@ def about_mean(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Float[Ar
     points = jnp.where(mask[:, None], points, 0)
     present = mask.astype(points.dtype)[:, None]
     mean = jnp.sum(present * points, axis=0) / jnp.maximum(jnp.sum(present), 1)
-    return present * (points - mean)
+    return present * (points - mean[None])
 
 
 def masked_mean(values: Float[Array, "..."], mask: AnyArray | None) -> Float[Array, ""]:

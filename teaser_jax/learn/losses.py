@@ -134,7 +134,8 @@ def keypoint_loss(
     check_positive(noise_bound=noise_bound)
     mask = mask_or_all(mask, src.shape[:-1])
     src, dst = (jnp.where(mask[..., None], at_least_float32(x), 0) for x in (src, dst))
-    difference = (dst - pose.apply(src)) / jnp.asarray(noise_bound, src.dtype)[..., None]
+    noise_bound = jnp.broadcast_to(jnp.asarray(noise_bound, src.dtype), mask.shape)
+    difference = (dst - pose.apply(src)) / noise_bound[..., None]
     # So far away the cost is 1 to all digits, and its square must not overflow.
     most = jnp.finfo(difference.dtype).max ** 0.25
     difference = jnp.clip(difference, -most, most)
@@ -200,7 +201,7 @@ def _same_place(
     together = jnp.concatenate([pose.apply(src), dst]), jnp.concatenate([src_mask, dst_mask])
     near_origin = about_mean(*together)
     distance2 = squared_distances(near_origin[: len(src)], near_origin[len(src) :])
-    both = src_mask[:, None] & dst_mask
+    both = src_mask[:, None] & dst_mask[None]
     same = both & (distance2 < radius**2)
     return same, same | (both & (distance2 > 4 * radius**2))
 

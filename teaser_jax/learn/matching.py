@@ -66,7 +66,7 @@ def match(
     src_descriptors, src_mask = harmless_rows(src_descriptors, src_mask)
     dst_descriptors, dst_mask = harmless_rows(dst_descriptors, dst_mask)
     similarity = inner_products(src_descriptors, dst_descriptors) / temperature
-    both = src_mask[:, None] & dst_mask
+    both = src_mask[:, None] & dst_mask[None]
     similarity = jnp.where(both, similarity, lowest_logit(similarity))
     counterpart = jnp.argmax(lax.stop_gradient(similarity), axis=1)
     best = jnp.take_along_axis(similarity, counterpart[:, None], axis=1)[:, 0]
@@ -113,7 +113,7 @@ def soft_counterparts(
     dst_descriptors, dst_mask = harmless_rows(dst_descriptors, dst_mask)
     dst_mask &= jnp.all(jnp.isfinite(dst), axis=1)
     similarity = inner_products(src_descriptors, dst_descriptors) / temperature
-    similarity = jnp.where(dst_mask, similarity, lowest_logit(similarity))
+    similarity = jnp.where(dst_mask[None], similarity, lowest_logit(similarity))
     dst = jnp.where(dst_mask[:, None], dst, 0)
     return jnp.matmul(jax.nn.softmax(similarity, axis=1), dst, precision=lax.Precision.HIGHEST)
 

@@ -8,12 +8,12 @@ Rings are matrices and means are products of matrices, which any device does wel
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, Real
 
@@ -86,7 +86,7 @@ def _read_scan(points: Array, viewpoint: Array, mask: Array, reach: Array) -> Sc
     points = jnp.where(mask[:, None], points, 0)
     difference = points[None] - points[:, None]
     distance = jnp.sqrt(jnp.sum(difference**2, axis=2))
-    pairs = mask[:, None] & mask & ~jnp.eye(len(points), dtype=bool)
+    pairs = mask[:, None] & mask[None] & ~jnp.eye(len(points), dtype=bool)
     mask &= jnp.any(pairs & (distance < reach), axis=1)
     radius = LEVELS[0] * reach
     normals = _normals(points, viewpoint, mask, pairs & (distance < radius), radius)
@@ -160,12 +160,12 @@ def describe(parameters: Parameters, scan: Scan) -> Float[Array, "n d"]:
 
 
 def _dense(key: PRNGKeyArray, inputs: int, outputs: int) -> dict[str, Array]:
-    weights = jax.random.normal(key, (inputs, outputs)) * np.sqrt(2 / inputs)
+    weights = jax.random.normal(key, (inputs, outputs)) * math.sqrt(2 / inputs)
     return {"weights": weights, "bias": jnp.zeros(outputs)}
 
 
 def _apply(layer: dict[str, Array], x: Array) -> Array:
-    return x @ layer["weights"] + layer["bias"]
+    return x @ layer["weights"] + layer["bias"][None]
 
 
 def _perceptron(layers: list[dict[str, Array]], x: Array) -> Array:
@@ -184,7 +184,7 @@ def _rings(scan: Scan) -> list[tuple[Array, Array]]:
     found, inner = [], jnp.asarray(-jnp.inf, distance2.dtype)
     for level in LEVELS:
         outer = (level * scan.reach) ** 2
-        ring = ((distance2 >= inner) & (distance2 < outer) & scan.mask).astype(distance2.dtype)
+        ring = ((distance2 >= inner) & (distance2 < outer) & scan.mask[None]).astype(distance2.dtype)
         found.append((ring, 1 / jnp.maximum(jnp.sum(ring, axis=1, keepdims=True), 1)))
         inner = outer
     return found
@@ -204,7 +204,7 @@ def _normals(
     mean = product(weight, near_origin) / count
     outer = (near_origin[:, :, None] * near_origin[:, None, :]).reshape(len(points), 9)
     spread = (product(weight, outer) / count).reshape(-1, 3, 3) - mean[:, :, None] * mean[:, None, :]
-    sight = viewpoint - points
+    sight = viewpoint[None] - points
     sight = sight * lax.rsqrt(jnp.maximum(jnp.sum(sight**2, axis=1, keepdims=True), 1e-12))
     preferred = PREFERENCE * radius**2 * sight[:, :, None] * sight[:, None, :]
     normals = jnp.linalg.eigh(spread - preferred)[1][:, :, 0]
@@ -226,4 +226,4 @@ def _angles(difference: Array, distance: Array, normals: Array) -> Float[Array, 
 def _soft_bins(x: Array, low: float, high: float) -> Array:
     """Say how close numbers are to each of a few places, by Gaussian bumps that overlap."""
     places, step = jnp.linspace(low, high, BINS, dtype=x.dtype), (high - low) / (BINS - 1)
-    return jnp.exp(-0.75 * ((x[..., None] - places) / step) ** 2)
+    return jnp.exp(-0.75 * ((x[..., None] - places[None, None]) / step) ** 2)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Real
 
-from teaser_jax.ground.arrays import AnyArray, Number, at_least_float32
+from teaser_jax.ground.arrays import AnyArray, Number, Placeholder, at_least_float32
 from teaser_jax.ground.checks import check_positive
 from teaser_jax.pose import Pose
 from teaser_jax.problem import make_problem
@@ -34,9 +34,9 @@ class Labels:
     """
 
     pose: Pose
-    inliers: Bool[AnyArray, "*batch n"]
-    trusted: Bool[AnyArray, "*batch"]
-    status: Int[AnyArray, "*batch"]
+    inliers: Bool[AnyArray, "... n"] | Placeholder
+    trusted: Bool[AnyArray, "..."] | Placeholder
+    status: Int[AnyArray, "..."] | Placeholder
 
 
 def teacher(

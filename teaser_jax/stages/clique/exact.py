@@ -170,7 +170,7 @@ class _Search:
             self.keep(np.flatnonzero(alive))
 
     def order(self) -> None:
-        """TracedNumber the vertices by degeneracy, largest cores first, and take the bound that gives."""
+        """Number the vertices by degeneracy, largest cores first, and take the bound that gives."""
         order, core = self.reduction.degeneracy_order(self.rows)
         self.keep(np.ascontiguousarray(order[::-1]))
         self.lower_upper(int(core.max()) + 1)

@@ -119,7 +119,7 @@ def pair_hypotheses(m: Measurements) -> Candidates:
 
     def score(turns: Array) -> Array:
         inner = jnp.matmul(turns.reshape(-1, 9), products.T, precision=lax.Precision.HIGHEST)
-        return jnp.sum(jnp.where(m.mask, jnp.minimum(lengths[None] - 2 * inner, m.cbar2), 0), axis=1)
+        return jnp.sum(jnp.where(m.mask[None], jnp.minimum(lengths[None] - 2 * inner, m.cbar2), 0), axis=1)
 
     def visit(block: Int[Array, ""], best: Candidates) -> Candidates:
         number = block * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
+from teaser_jax.ground.arrays import AnyArray
 
 # The positions of the six free numbers of a skew 4x4 block, each with its negative mirrored.
 ROWS, COLUMNS = (0, 0, 1, 0, 1, 2), (1, 2, 2, 3, 3, 3)
@@ -29,13 +30,13 @@ class Measurements(NamedTuple):
         mask: Measurements that exist; the others hold zeros.
     """
 
-    src: Float[Array, "k 3"]
-    dst: Float[Array, "k 3"]
-    cbar2: Float[Array, ""]
-    mask: Bool[Array, " k"]
+    src: Float[AnyArray, "k 3"]
+    dst: Float[AnyArray, "k 3"]
+    cbar2: Float[AnyArray, ""]
+    mask: Bool[AnyArray, " k"]
 
     @property
-    def residuals(self) -> Float[Array, "k 3"]:
+    def residuals(self) -> Float[AnyArray, "k 3"]:
         """b_k - a_k."""
         return self.dst - self.src
 
@@ -97,11 +98,11 @@ def in_frame_of(
     return Framed(Measurements(src, so3.rotate(frame.T, dst), cbar2, turns), frame, constant)
 
 
-def pair_matrix(src: Float[Array, "k 3"], dst: Float[Array, "k 3"]) -> Float[Array, "k 4 4"]:
+def pair_matrix(src: Float[AnyArray, "k 3"], dst: Float[AnyArray, "k 3"]) -> Float[Array, "k 4 4"]:
     """The symmetric P with q^T P q = b . R(q) a for every unit quaternion q, scalar last."""
     outer = dst[:, :, None] * src[:, None, :]
     inner = jnp.trace(outer, axis1=1, axis2=2)
-    top = outer + jnp.swapaxes(outer, 1, 2) - inner[:, None, None] * jnp.eye(3, dtype=src.dtype)
+    top = outer + jnp.swapaxes(outer, 1, 2) - inner[:, None, None] * jnp.eye(3, dtype=src.dtype)[None]
     cross = jnp.cross(src, dst)
     top = jnp.concatenate([top, cross[:, :, None]], axis=2)
     bottom = jnp.concatenate([cross, inner[:, None]], axis=1)[:, None, :]
@@ -114,7 +115,7 @@ def cost_blocks(m: Measurements) -> tuple[Float[Array, "k 4 4"], Float[Array, "k
     The cost of a measurement is q^T H+ q + theta q^T H- q.
     """
     size = 0.5 * (jnp.sum(m.src**2, axis=1) + jnp.sum(m.dst**2, axis=1))
-    eye = jnp.eye(4, dtype=m.src.dtype)
+    eye = jnp.eye(4, dtype=m.src.dtype)[None]
     both = size[:, None, None] * eye - pair_matrix(m.src, m.dst)
     exists, half = m.mask[:, None, None], 0.5 * m.cbar2 * eye
     return jnp.where(exists, both + half, 0), jnp.where(exists, both - half, 0)
