@@ -30,7 +30,8 @@ def new_figure(size: tuple[Number, Number]) -> Figure:
     except ImportError as error:
         raise ImportError("plots need matplotlib: pip install 'teaser-jax[viz]'") from error
     layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
-    return Figure(figsize=size, dpi=150, facecolor="white", layout=layout)
+    width, height = (float(x) for x in size)
+    return Figure(figsize=(width, height), dpi=150, facecolor="white", layout=layout)
 
 
 def label(axes: Axes, title: str, x: str, y: str, *, counts: bool = True) -> None:
