@@ -232,7 +232,7 @@ def test_graphs_without_a_proof_go_to_the_host():
         assert found.clique_size == alone.solution.clique_size
 
 
-def test_nothing_and_bad_input():
+def test_nothing_and_bad_input(unchecked):
     good = problem(0)
     assert tj.solve_batch([]) == []
     with pytest.raises(ValueError, match=r"problems\[1\] is of type tuple"):

@@ -33,7 +33,7 @@ from teaser_jax.stages.clique.maximum import finish_on_host
 WORKERS = max(2, min(8, os.cpu_count() or 1))
 RUNS_A_CHUNK = 4  # of the small runs of a CPU
 
-Indices: TypeAlias = Int[np.ndarray, " b"]
+Indices: TypeAlias = Int[np.ndarray, "_"]  # as many as may be
 Group: TypeAlias = "tuple[Indices, Problem | list[Problem]]"  # places in the batch, and problems of one size
 Chunk: TypeAlias = "tuple[Indices, Solution]"  # places in the batch, and their solutions, padded
 

@@ -15,7 +15,7 @@ from teaser_jax.problem import Problem
 from teaser_jax.settings import Settings
 
 
-def by_size(problems: Sequence[Problem]) -> dict[Size, Int[np.ndarray, " b"]]:
+def by_size(problems: Sequence[Problem]) -> dict[Size, Int[np.ndarray, "_"]]:
     """The places of the problems of each size, in the user's order."""
     places: dict[Size, list[int]] = {}
     for k, problem in enumerate(problems):
