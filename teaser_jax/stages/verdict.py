@@ -188,7 +188,7 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
     most = jnp.max(jnp.where(inliers, problem.confidence, 0), initial=0)
     turned = jnp.sum(pose.rotation[:, :, None] * fit.correlation[:, None, :], axis=0)
     left = jnp.trace(turned) - so3.largest_eigenvalue((turned + turned.T) / 2)
-    rise = 2 * (1 - np.cos(SMALLEST_TURN)) * pose.scale * left / jnp.where(most > 0, most, 1)
+    rise = float(2 * (1 - np.cos(SMALLEST_TURN))) * pose.scale * left / jnp.where(most > 0, most, 1)
     radius2 = jnp.where(inliers, jnp.sum((problem.src - fit.src_mean[None]) ** 2, axis=1), 0)
     reach2 = jnp.where(inliers, problem.cbar2 * problem.noise_bound**2, jnp.inf)
     extended = pose.scale**2 * jnp.max(radius2, initial=0) > jnp.min(reach2, initial=jnp.inf)
