@@ -37,7 +37,7 @@ def rotate(
     return jnp.einsum("...ij,...nj->...ni", rotation, points, precision=lax.Precision.HIGHEST)
 
 
-def hat(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def hat(vector: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
     """The skew matrix with ``hat(v) @ x = cross(v, x)``."""
     x, y, z = vector
     zero = jnp.zeros_like(x)

@@ -199,7 +199,7 @@ def test_a_control_that_makes_no_sense_is_no_success(mu, x64):
     assert found.status == tj.Status.NOT_CONVERGED
 
 
-def test_impossible_controls_are_refused_outside_jit():
+def test_impossible_controls_are_refused_outside_jit(unchecked):
     problem = blurred(11)
     for mu in (0.0, -1.0, np.nan, np.inf, np.ones(2)):
         with pytest.raises(ValueError, match="expected one finite number above 0"):

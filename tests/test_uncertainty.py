@@ -135,7 +135,7 @@ def test_no_noise_is_exact(x64):
     assert np.all(np.isinf(np.diag(found.information)))
 
 
-def test_bad_arguments_are_told_apart():
+def test_bad_arguments_are_told_apart(unchecked):
     matches = random_matches(8, N)
     result = tj.register(matches.src, matches.dst, noise_bound=0.05)
     for sigma, words in ((-1.0, "below 0"), (np.nan, "below 0"), (np.ones(3), "shape")):
@@ -191,7 +191,7 @@ def test_far_origins_keep_a_finite_information(scale, offset):
     np.testing.assert_allclose(exact.covariance[:3, :3], near.covariance[:3, :3], rtol=1e-6, atol=1e-12)
 
 
-def test_other_records_are_told_apart():
+def test_other_records_are_told_apart(unchecked):
     drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
     result = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
     problem = tj.host_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)

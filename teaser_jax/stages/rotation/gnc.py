@@ -90,7 +90,7 @@ def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: float | Float[AnyArray,
 
 
 def gnc_weights(
-    r2: Float[Array, "*k"], gnc_mu: Float[Array, ""], cbar2: Float[Array, ""]
+    r2: Float[Array, "*k"], gnc_mu: float | Float[AnyArray, ""], cbar2: float | Float[AnyArray, ""]
 ) -> Float[Array, "*k"]:
     """The weight of each measurement under a control mu.
 
@@ -109,7 +109,9 @@ def gnc_weights(
     return jnp.clip(gnc_mu * (jnp.sqrt((1 + 1 / gnc_mu) * cbar2 / jnp.maximum(r2, floor)) - 1), 0, 1)
 
 
-def gnc_cost(r2: Float[Array, "*k"], gnc_mu: Float[Array, ""], cbar2: Float[Array, ""]) -> Float[Array, "*k"]:
+def gnc_cost(
+    r2: Float[Array, "*k"], gnc_mu: float | Float[AnyArray, ""], cbar2: float | Float[AnyArray, ""]
+) -> Float[Array, "*k"]:
     """The softened cost of each measurement under a control mu.
 
     It is r^2 below the first threshold of ``gnc_weights``, c^2 above the second, and
