@@ -56,7 +56,11 @@ class ErrorBounds:
 
 
 def error_bounds(
-    problem: Problem, solution: Solution, *, wrong: int | np.integer = 0, certificate: Certificate | None = None
+    problem: Problem,
+    solution: Solution,
+    *,
+    wrong: int | np.integer = 0,
+    certificate: Certificate | None = None,
 ) -> ErrorBounds:
     """Bound the error of a pose, and say what each bound rests on.
 

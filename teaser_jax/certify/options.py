@@ -40,7 +40,10 @@ class Options(NamedTuple):
 
 
 def checked_options(
-    tolerance: Any, iterations: int | np.integer | None, method: CertifyMethod, max_measurements: int | np.integer
+    tolerance: Any,
+    iterations: int | np.integer | None,
+    method: CertifyMethod,
+    max_measurements: int | np.integer,
 ) -> Options:
     """Check what all who certify are asked; the method is checked where it has its name.
 

@@ -75,7 +75,13 @@ def scan_pair(
 
 
 def partial_scan(
-    seed: Seed | np.random.Generator, model: Real[np.ndarray, "m 3"], view: Vector, *, n: int, sigma: Number, cells: int = 40
+    seed: Seed | np.random.Generator,
+    model: Real[np.ndarray, "m 3"],
+    view: Vector,
+    *,
+    n: int,
+    sigma: Number,
+    cells: int = 40,
 ) -> Points:
     """Scan the side of a model that is seen from a direction, with Gaussian noise.
 
