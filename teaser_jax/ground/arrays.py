@@ -114,7 +114,7 @@ def at_least_float32(values: AnyArray) -> Float[Array, "..."]:
 
 
 def float32_or_wider(dtype: Any) -> np.dtype:
-    """Choose the kind of number to compute in for values of a kind: their own, or float32 where it is wider."""
+    """Choose the kind of number to compute in: that of the values, or float32 where it is wider."""
     with jax.numpy_dtype_promotion("standard"):  # whatever JAX is set to: nothing is mixed in silence here
         return jnp.promote_types(dtype, jnp.float32)
 
