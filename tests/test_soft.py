@@ -153,7 +153,7 @@ def test_the_cost_is_stationary_and_least(x64):
 
 
 def test_weights_are_the_slope_of_the_cost(x64):
-    r2 = np.linspace(0, 4, 1001)
+    r2 = jnp.linspace(0, 4, 1001)
     for mu in (0.1, 1.0, 30.0):
         slope = jax.vmap(jax.grad(gnc_cost), (0, None, None))(r2, mu, 1.0)
         kinks = np.minimum(np.abs(r2 - mu / (mu + 1)), np.abs(r2 - (mu + 1) / mu)) < 1e-9

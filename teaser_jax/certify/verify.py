@@ -24,7 +24,7 @@ def verify(
     certificate: Any,
     *,
     noise_bound: Any,
-    cbar2: float = 1.0,
+    cbar2: Any = 1.0,
     tolerance: float = 1e-3,
 ) -> bool:
     """Check the claims of a certificate about a rotation, from the data and the stored dual alone.

@@ -192,7 +192,12 @@ def matching_loss(
 
 
 def _same_place(
-    pose: Pose, src: AnyArray, dst: AnyArray, src_mask: Array, dst_mask: Array, radius: AnyArray
+    pose: Pose,
+    src: Float[AnyArray, "n 3"],
+    dst: Float[AnyArray, "m 3"],
+    src_mask: Bool[Array, " n"],
+    dst_mask: Bool[Array, " m"],
+    radius: Number | Float[AnyArray, ""],
 ) -> tuple[Bool[Array, "n m"], Bool[Array, "n m"]]:
     """Tell which pairs of points are the same place under a pose, and which of all pairs are asked about."""
     src_mask &= jnp.all(jnp.isfinite(src), axis=1)
