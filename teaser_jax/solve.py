@@ -29,7 +29,7 @@ from teaser_jax.solution import Selection, Solution
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import maximum_clique
 from teaser_jax.stages.consistency import consistency_graph
-from teaser_jax.stages.refinement import refine, squared_residuals, truncated_cost
+from teaser_jax.stages.refinement import Refinement, refine, squared_residuals, truncated_cost
 from teaser_jax.stages.scale import ScalePairs, estimate_scale
 from teaser_jax.stages.verdict import evidence_of, status_of
 
@@ -134,17 +134,19 @@ def choose(
     found = cascade(p, graph.scale, members, settings, run)
     inliers, settled = members & jnp.all(found.axes, axis=1), found.settled
     if settings.refine:
-        inliers, still = run("refinement", find_inliers, p, found.pose, settings)
+        inliers, still = run("refinement", find_inliers, p, found.pose, settings.refine)
         settled &= still
     refined = jnp.asarray(settings.refine is not None)
     return Selection(graph.scale_pairs, members, found.tims, found.axes, inliers, refined), settled
 
 
-def find_inliers(p: Problem, start: Pose, settings: Settings) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
+def find_inliers(
+    p: Problem, start: Pose, refinement: Refinement
+) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
     """The consensus set where the joint cost (6) stops falling, and whether it did stop."""
     return refine(
         start, p.src, p.dst, p.noise_bound, p.mask,
-        scale=p.scale, cbar2=p.cbar2, iterations=settings.refine.iterations,
+        scale=p.scale, cbar2=p.cbar2, iterations=refinement.iterations,
     )  # fmt: skip
 
 
