@@ -67,11 +67,7 @@ class Pose:
         """The pose from the target to the source frame, ``T_src_dst``."""
         xp = namespace(self.rotation, self.translation, self.scale)
         transposed = xp.swapaxes(self.rotation, -1, -2)
-<<<<<<< HEAD
         scale: AnyArray = 1 / self.scale
-=======
-        scale: Any = 1 / self.scale
->>>>>>> types
         moved = so3.rotate(transposed, self.translation[..., None, :])[..., 0, :]
         return Pose(transposed, -scale[..., None] * moved, scale)
 

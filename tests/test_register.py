@@ -226,7 +226,7 @@ def test_after_warmup_nothing_compiles(most, stream):
 
 
 @pytest.mark.parametrize("max_points", [0, -3, 1.5, "10", None, float("nan")])
-def test_warmup_wants_a_size(max_points):
+def test_warmup_wants_a_size(max_points, unchecked):
     with pytest.raises(ValueError, match="max_points"):
         tj.warmup(max_points)
 
