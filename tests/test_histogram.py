@@ -178,7 +178,7 @@ def test_a_batch_equals_a_loop(few_bins):
 @partial(jax.jit, static_argnames="method")  # which is chosen when this is traced
 def compiled_scale(src, dst, noise_bound, *, method):
     one = jnp.ones((), src.dtype)
-    return scale.estimate_scale(src, dst, noise_bound, np.ones(len(src), bool), cbar2=one)
+    return scale.estimate_scale(src, dst, noise_bound, jnp.ones(len(src), bool), cbar2=one)
 
 
 @pytest.mark.long
