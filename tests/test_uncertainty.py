@@ -60,7 +60,7 @@ def test_errors_are_as_large_as_the_covariance_says(scale, refine, x64):
     conventions = CONVENTIONS if scale and refine else CONVENTIONS[:1]  # each takes seconds to compile
 
     def run(key):
-        noise = sigma[:, None] * jax.random.normal(key, (N, 3)) * matches.inliers[:, None]
+        noise = sigma[:, None] * jax.random.normal(key, (N, 3)) * matches.inliers[:, None].astype(float)
         problem = replace(base, dst=base.dst + noise)
         solution = tj.solve(problem, settings)
         squares, apart = [], []
