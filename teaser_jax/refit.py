@@ -54,6 +54,7 @@ def refit(problem: Problem, selection: Selection) -> Pose:
             "the selection was made with a known scale, and the problem has none: give its scale."
         )
     cleaned, _ = clean(problem)
+    selection = jax.tree.map(jnp.asarray, selection)
     return lax.cond(
         selection.refined,
         lambda: joint_pose(cleaned, selection),

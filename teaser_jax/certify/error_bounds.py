@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from teaser_jax.certify.bounds import Bound, InlierSet
@@ -86,7 +87,7 @@ def error_bounds(
     p, s = on_host((problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
     with jax.enable_x64(True):
-        cascade = jax.device_get(cascade_pose(clean(p)[0], s.selection))
+        cascade = jax.device_get(cascade_pose(clean(p)[0], jax.tree.map(jnp.asarray, s.selection)))
     agreed = InlierSet.of(p, cascade, s.selection.clique & s.selection.translation.all(axis=1))
     return ErrorBounds(
         whole_set(InlierSet.of(p, s.pose, s.inliers), wrong),

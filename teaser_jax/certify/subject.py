@@ -42,7 +42,8 @@ def subject_on_host(problem: Problem, solution: Solution, about: About) -> Subje
         return _about_pose(problem, solution)
     with jax.enable_x64(True):
         members = int(np.sum(solution.selection.clique))
-        return jax.device_get(_about_tims(clean(problem)[0], solution, about, members))
+        there = jax.tree.map(jnp.asarray, solution)
+        return jax.device_get(_about_tims(clean(problem)[0], there, about, members))
 
 
 def traced_subject(
