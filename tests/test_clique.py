@@ -304,7 +304,7 @@ def test_graph_of_is_the_graph():
 
 def test_warming_runs_through_every_loop():
     nothing = Clique(np.zeros(10, bool), np.int32(10))
-    found = search_clique(two_pentagons(), nothing, nodes=100, seconds=60.0)
+    found = search_clique(two_pentagons(), nothing, nodes=10_000, seconds=600.0)
     assert found.members.sum() == found.upper_bound == clique_number(unpack(two_pentagons(), 10)) == 4
     # Those that the search calls; what they call in turn is compiled into them.
     called = {

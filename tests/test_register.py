@@ -311,7 +311,6 @@ def test_on_constants_inside_jit_it_names_the_function_to_use_too(problem):
         lambda: tj.Settings(rotation=None),
         lambda: tj.Settings(clique="best"),
         lambda: tj.Settings(refine="no"),
-        lambda: tj.Settings(refine=None),
         lambda: tj.Settings(rotation=Gnc(factor="2")),
         lambda: tj.Settings(rotation=Gnc(iterations=2**31)),
         lambda: tj.Settings(refine=3),

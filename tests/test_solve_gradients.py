@@ -172,9 +172,9 @@ def test_descent_through_the_solver_finds_what_distorts_its_input():
         traces.append(1)
 
         def one(src, dst, truth):
-            problem = tj.make_problem(src * guess, dst, noise_bound=0.15)
+            problem = tj.make_problem(src * guess[None], dst, noise_bound=0.15)
             pose = tj.solve(problem, tj.Settings(clique="greedy")).pose
-            return tj.learn.point_loss(pose, truth, src * guess)
+            return tj.learn.point_loss(pose, truth, src * guess[None])
 
         return jnp.mean(jax.vmap(one)(seen, dst, truth))
 

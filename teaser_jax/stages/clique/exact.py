@@ -315,7 +315,7 @@ def load_kernels() -> bool:
         try:
             # Later budgets time the search alone, because this one has run through every loop.
             nothing = Clique(np.zeros(10, bool), np.int32(10))
-            _Search(two_pentagons(), nothing, nodes=100, seconds=60.0).run()
+            _Search(two_pentagons(), nothing, nodes=10_000, seconds=float("inf")).run()
             _ready = True
         finally:
             notice.cancel()
