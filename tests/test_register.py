@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import networkx as nx
 import numpy as np
@@ -270,7 +268,8 @@ def test_any_input_gives_an_error_or_a_finite_answer(data):
     if found is None:
         assert len(refused) > 20
         return
-    for leaf in jax.tree.leaves(dataclasses.replace(found.solution, selection=None)):
+    told = {name: value for name, value in vars(found.solution).items() if name != "selection"}
+    for leaf in jax.tree.leaves(told):
         assert np.all(np.isfinite(leaf))
     assert not found.ok or found.inliers.sum() >= 3
 
