@@ -232,7 +232,9 @@ def _train(
         drawn = _drawn(pairs, key, batch, points)
         taught = lax.stop_gradient(labels(parameters, drawn, noise_bound))
         value, slope = jax.value_and_grad(loss)(parameters, drawn, taught)
-        change, memory = optimizer.update(slope, memory, parameters)
+        # An optimizer is somebody else's code, and may mix kinds of numbers.
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            change, memory = optimizer.update(slope, memory, parameters)
         parameters = jax.tree.map(jnp.add, parameters, change)
         truth = drawn.truth
         angle = jnp.full(batch, jnp.nan) if truth is None else rotation_loss(taught.pose, truth)

@@ -51,7 +51,7 @@ class Measurements(NamedTuple):
         r2 = jnp.sum(self.residuals**2, axis=1)
         return jnp.sum(jnp.where(self.mask, jnp.minimum(r2, self.cbar2), 0))
 
-    def turned(self, rotation: Float[Array, "3 3"]) -> Measurements:
+    def turned(self, rotation: Float[AnyArray, "3 3"]) -> Measurements:
         """The same in the frame of another candidate, given from this one's."""
         return self._replace(dst=so3.rotate(rotation.T, self.dst))
 
