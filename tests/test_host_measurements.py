@@ -22,7 +22,7 @@ def test_rows_of_the_mask_come_first_and_padding_comes_off():
     bounds = rng.uniform(1, 2, 25)
     read = read_measurements(src.astype(np.float32), dst, bounds, 1.0, mask)
     assert read.src.dtype == np.float64
-    assert len(read.src) == padded_size(mask.sum())
+    assert len(read.src) == padded_size(int(mask.sum()))
     assert read.measured == mask.sum()
     plain = without_padding(read)
     assert_array_equal(plain.src, src[mask].astype(np.float32))

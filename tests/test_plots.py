@@ -6,6 +6,7 @@ import io
 import sys
 from dataclasses import replace
 
+import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def test_every_stage(small, solved):
     selection = solved.solution.selection
     edges = np.array(small.inliers[:, None] & small.inliers & ~np.eye(32, dtype=bool))
     edges[0, 1] = edges[1, 0] = True
-    edge_bits = np.asarray(bits.pack(edges))
+    edge_bits = np.asarray(bits.pack(jnp.asarray(edges)))
     r2 = np.random.default_rng(0).chisquare(3, size=32)
     offsets = small.dst - solved.pose.apply(small.src) + solved.pose.translation
     for figure in (

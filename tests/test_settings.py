@@ -41,6 +41,32 @@ def test_a_name_is_its_record(field, name, record):
     assert jax.tree.structure(by_name) == jax.tree.structure(by_record)
 
 
+@pytest.mark.parametrize(
+    ("field", "names"),
+    [
+        ("clique", ("exact", "greedy", "none", "networkx")),
+        ("rotation", ("gnc", "global", "sdp")),
+        ("refine", (True, False)),
+    ],
+)
+def test_jax_tells_every_method_from_every_other(field, names):
+    structures = [jax.tree.structure(tj.Settings(**{field: name})) for name in names]
+    assert len(set(structures)) == len(names)
+
+
+@pytest.mark.parametrize("door", ["solve", "jit", "batch"])
+def test_a_program_of_one_method_is_not_run_for_another(door):
+    problem = problem_of(random_matches(0))
+    solve = {
+        "solve": tj.solve,
+        "jit": jax.jit(tj.solve),
+        "batch": lambda problem, settings: tj.solve_batch([problem], settings)[0],
+    }[door]
+    greedy, every = (solve(problem, tj.Settings(clique=name)) for name in ("greedy", "none"))
+    assert int(greedy.selection.clique.sum()) < 32
+    assert int(every.selection.clique.sum()) == 32
+
+
 def test_every_number_is_a_plain_one():
     records = (
         Gnc(factor=2, tolerance=np.float32(0.5)),
@@ -80,7 +106,7 @@ def test_new_numbers_compile_nothing_and_new_caps_do():
         (lambda: ScaleVote(3), r"ScaleVote.range is 3: expected \(low, high\)"),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_refused_at_once(made, said):
+def test_what_makes_no_sense_is_refused_at_once(made, said, unchecked):
     with pytest.raises(ValueError, match=said):
         made()
 
@@ -95,7 +121,7 @@ def test_what_makes_no_sense_is_refused_at_once(made, said):
     ],
     ids=str,
 )  # fmt: skip
-def test_what_only_the_doors_can_see_is_refused_there(settings):
+def test_what_only_the_doors_can_see_is_refused_there(settings, unchecked):
     with pytest.raises(ValueError, match="expected"):
         check_settings(settings)
     with pytest.raises(ValueError, match="expected"):

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.ground.loops import until_settled
-from teaser_jax.ground.numbers import count, settle
+from teaser_jax.ground.numbers import count, named, settle
 from teaser_jax.pose import Pose
 from teaser_jax.stages.rotation.tims import correlation
 
@@ -31,6 +31,7 @@ class Refinement:
         iterations: Cap on the rounds; static.
     """
 
+    name: str = named("refinement")
     iterations: int = count(50)
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import Placeholder, is_traced, safe_norm, safe_sqrt
-from teaser_jax.ground.numbers import TracedNumber
+from teaser_jax.ground.numbers import TracedNumber, named
 from teaser_jax.stages.pairs import (
     PairSlice,
     fold_pairs,
@@ -40,6 +40,7 @@ class ScaleVote:
             a hundred; an answer further away has no consensus.
     """
 
+    name: str = named("vote")
     range: tuple[TracedNumber, TracedNumber] | Placeholder = field(default=(0.0, float("inf")))
 
     def __post_init__(self) -> None:

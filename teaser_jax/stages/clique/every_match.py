@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, UInt32
 
 from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.ground.numbers import named
 from teaser_jax.stages.clique.clique import Clique
 
 
@@ -19,6 +20,7 @@ from teaser_jax.stages.clique.clique import Clique
 class EveryMatch:
     """Take all usable matches instead of a clique; nothing is proved of them."""
 
+    name: str = named("none")
     needs_host: ClassVar[bool] = False
     prunes: ClassVar[bool] = False
 

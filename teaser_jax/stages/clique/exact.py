@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, UInt32, UInt64
 
 from teaser_jax.ground.arrays import AnyArray
-from teaser_jax.ground.numbers import TracedNumber, count, number, settle
+from teaser_jax.ground.numbers import TracedNumber, count, named, number, settle
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.greedy import DROPPED_SHARE, greedy_clique
 from teaser_jax.stages.clique.oracle import networkx_clique
@@ -50,6 +50,7 @@ class ExactClique:
         seconds: Budget of time [s]; traced. Compiling the search is not counted.
     """
 
+    name: str = named("exact")
     nodes: TracedNumber = count(100_000_000, traced=True)
     seconds: TracedNumber = number(60.0, least=0, infinite=True)
     needs_host: ClassVar[bool] = True

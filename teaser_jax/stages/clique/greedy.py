@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.ground.numbers import named
 from teaser_jax.stages.clique.clique import Clique
 
 SEEDS = 8  # cliques grown where no search follows
@@ -25,6 +26,7 @@ DROPPED_SHARE = 0.15
 class GreedyClique:
     """Take the best of a few greedy cliques; all of it stays on the device. The bound is proved."""
 
+    name: str = named("greedy")
     needs_host: ClassVar[bool] = False
     prunes: ClassVar[bool] = True
 

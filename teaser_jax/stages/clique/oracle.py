@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, UInt32
 
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.ground.numbers import named
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.greedy import greedy_clique
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 class NetworkxClique:
     """Search every graph on the host with networkx, whatever the device has proved: the slow oracle."""
 
+    name: str = named("networkx")
     needs_host: ClassVar[bool] = True
     prunes: ClassVar[bool] = True
 

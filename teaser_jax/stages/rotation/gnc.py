@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.loops import until_settled
-from teaser_jax.ground.numbers import TracedNumber, count, number, settle
+from teaser_jax.ground.numbers import TracedNumber, count, named, number, settle
 from teaser_jax.stages.rotation.tims import Rotation, Tims, Weigh
 
 
@@ -32,6 +32,7 @@ class Gnc:
         iterations: Cap on the rounds; static.
     """
 
+    name: str = named("gnc")
     factor: TracedNumber = number(1.4, above=1)
     tolerance: TracedNumber = number(1e-6, least=0)
     iterations: int = count(100)

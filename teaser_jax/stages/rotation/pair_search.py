@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from teaser_jax import so3
 from teaser_jax.ground import bits
 from teaser_jax.ground.loops import until_settled
+from teaser_jax.ground.numbers import named
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.quadratic_form import Measurements
 
@@ -37,6 +38,7 @@ class PairSearch:
         gnc: How GNC finds the first candidate.
     """
 
+    name: str = named("global")
     gnc: Gnc = Gnc()
     needs_host: ClassVar[bool] = False
 

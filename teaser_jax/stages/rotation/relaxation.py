@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax import so3
+from teaser_jax.ground.numbers import named
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.pair_search import polish, search_pairs
 from teaser_jax.stages.rotation.quadratic_form import COLUMNS, ROWS, Measurements, cost_matrix
@@ -39,6 +40,7 @@ class Relaxation:
         gnc: How GNC finds the first candidate.
     """
 
+    name: str = named("sdp")
     gnc: Gnc = Gnc()
     needs_host: ClassVar[bool] = True
 
