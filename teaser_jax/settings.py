@@ -36,6 +36,7 @@ RotationMethod: TypeAlias = Gnc | PairSearch | Relaxation
 SCALES = {"vote": ScaleVote}
 CLIQUES = {"exact": ExactClique, "greedy": GreedyClique, "networkx": NetworkxClique, "none": EveryMatch}
 ROTATIONS = {"gnc": Gnc, "global": PairSearch, "sdp": Relaxation}
+METHODS: dict[str, dict[str, Any]] = {"scale_search": SCALES, "clique": CLIQUES, "rotation": ROTATIONS}
 
 
 @jax.tree_util.register_dataclass
@@ -72,7 +73,7 @@ class Settings:
     def __post_init__(self) -> None:
         one_of("Settings.vote", self.vote, get_args(Criterion))
         one_of("Settings.tim_graph", self.tim_graph, get_args(TimGraph))
-        for name, known in (("scale_search", SCALES), ("clique", CLIQUES), ("rotation", ROTATIONS)):
+        for name, known in METHODS.items():
             object.__setattr__(self, name, as_record(f"Settings.{name}", getattr(self, name), known))
         if isinstance(self.refine, str):
             one_of("Settings.refine", self.refine, (True, False))
@@ -113,7 +114,7 @@ def check_settings(settings: Any) -> None:
     """
     if not isinstance(settings, Settings):
         raise ValueError(f"settings is {settings!r}: expected Settings, as in Settings(clique='greedy').")
-    for name, known in (("scale_search", SCALES), ("clique", CLIQUES), ("rotation", ROTATIONS)):
+    for name, known in METHODS.items():
         check_record(f"Settings.{name}", getattr(settings, name), known)
     if not isinstance(settings.refine, Refinement | None):
         one_of("Settings.refine", settings.refine, (True, False))

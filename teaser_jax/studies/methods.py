@@ -13,7 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from teaser_jax import metrics
-from teaser_jax.certify.proof import CertifyMethod
+from teaser_jax.certify.options import CertifyMethod
 from teaser_jax.certify.rotation import certify_rotation
 from teaser_jax.pose import Pose
 from teaser_jax.profile import profile
