@@ -12,7 +12,6 @@ from jaxtyping import Bool
 
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import compile_ahead
-from teaser_jax.certify.pose import MAX_TRACED
 from teaser_jax.certify.pose import certify as certify_pose
 from teaser_jax.engine.compiler import is_out_of_memory
 from teaser_jax.engine.single import solve_one
@@ -184,5 +183,5 @@ def warmup(
     if isinstance(settings.clique, ExactClique):
         load_kernels()
     if certify:
-        compile_ahead(min(max_points, MAX_TRACED))
+        compile_ahead(max_points)
     return sizes

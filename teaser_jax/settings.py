@@ -33,9 +33,9 @@ TimGraph: TypeAlias = Literal["chain", "complete"]
 RotationMethod: TypeAlias = Gnc | PairSearch | Relaxation
 
 # What each choice may be, and the names that stand for the records with their defaults.
-SCALES = {"vote": ScaleVote}
-CLIQUES = {"exact": ExactClique, "greedy": GreedyClique, "networkx": NetworkxClique, "none": EveryMatch}
-ROTATIONS = {"gnc": Gnc, "global": PairSearch, "sdp": Relaxation}
+SCALES = {method.name: method for method in (ScaleVote,)}
+CLIQUES = {method.name: method for method in (ExactClique, GreedyClique, NetworkxClique, EveryMatch)}
+ROTATIONS = {method.name: method for method in (Gnc, PairSearch, Relaxation)}
 METHODS: dict[str, dict[str, Any]] = {"scale_search": SCALES, "clique": CLIQUES, "rotation": ROTATIONS}
 
 

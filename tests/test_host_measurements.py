@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from teaser_jax.certify.host_measurements import padded_size, read_measurements, without_padding
+from teaser_jax.certify.host_measurements import padded_count, read_measurements, without_padding
 
 
 def test_sizes_are_few_and_little_larger():
-    assert all(padded_size(k) >= max(k, 16) for k in range(1000))
-    assert all(padded_size(k) <= max(16, k + 8, 1.26 * k) for k in range(1000))
-    assert len({padded_size(k) for k in range(1001)}) < 60
+    assert all(padded_count(k) >= max(k, 16) for k in range(1000))
+    assert all(padded_count(k) <= max(16, k + 8, 1.26 * k) for k in range(1000))
+    assert len({padded_count(k) for k in range(1001)}) < 60
 
 
 def test_rows_of_the_mask_come_first_and_padding_comes_off():
@@ -22,7 +22,7 @@ def test_rows_of_the_mask_come_first_and_padding_comes_off():
     bounds = rng.uniform(1, 2, 25)
     read = read_measurements(src.astype(np.float32), dst, bounds, 1.0, mask)
     assert read.src.dtype == np.float64
-    assert len(read.src) == padded_size(int(mask.sum()))
+    assert len(read.src) == padded_count(int(mask.sum()))
     assert read.measured == mask.sum()
     plain = without_padding(read)
     assert_array_equal(plain.src, src[mask].astype(np.float32))

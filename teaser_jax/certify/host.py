@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
 from teaser_jax.certify.dual import Dual
-from teaser_jax.certify.host_measurements import HostMeasurements, padded, padded_size
+from teaser_jax.certify.host_measurements import HostMeasurements, padded, padded_count
 from teaser_jax.certify.options import CertifyMethod, Options
 from teaser_jax.certify.proof import (
     Attempt,
@@ -31,6 +31,7 @@ from teaser_jax.ground.arrays import AnyArray, inside_jit
 from teaser_jax.stages.rotation.quadratic_form import Framed, in_frame_of
 
 QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
+COMPILED_AHEAD = 128  # measurements: programs of larger ones take longest to compile, and are rarely asked for
 
 Result = TypeVar("Result")
 
@@ -99,14 +100,14 @@ def certify_on_host(
 
 
 def compile_ahead(most: int) -> None:
-    """Compile all programs that certify up to so many measurements."""
+    """Compile all programs that certify up to so many measurements, 128 at most."""
 
     def everything(measurements: HostMeasurements) -> tuple[Certificate, Certificate]:
         pending = _closed_form(measurements, np.eye(3), np.float64(1e-3)).pending
         return _iterated(pending, np.int32(0)), _bounded(pending)
 
     three = HostMeasurements(np.eye(3), np.eye(3), np.ones(3), np.asarray(1.0), np.ones(3, bool))
-    for size in sorted({padded_size(k) for k in range(1, most + 1)}):
+    for size in sorted({padded_count(k) for k in range(1, min(most, COMPILED_AHEAD) + 1)}):
         jax.block_until_ready(in_float64(partial(everything, padded(three, size))))
 
 

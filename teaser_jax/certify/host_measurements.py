@@ -51,7 +51,7 @@ def read_measurements(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: An
         raise ValueError("noise_bound and cbar2 must be finite numbers above 0.")
     k = int(mask.sum())
     kept = HostMeasurements(src[mask], dst[mask], bound[mask], cbar2, np.ones(k, bool))
-    return padded(kept, padded_size(k))
+    return padded(kept, padded_count(k))
 
 
 def padded(measurements: HostMeasurements, size: int) -> HostMeasurements:
@@ -80,7 +80,7 @@ def without_padding(measurements: HostMeasurements) -> HostMeasurements:
     )
 
 
-def padded_size(k: int) -> int:
+def padded_count(k: int) -> int:
     """Round k up to the size of the program that serves it: an eighth more at most, sixteen at least."""
     step = max(8, 1 << max((k - 1).bit_length() - 3, 0))
     return max(16, -(-k // step) * step)
