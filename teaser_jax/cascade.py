@@ -30,7 +30,7 @@ class Cascade(NamedTuple):
 def find_cascade(
     p: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], settings: Settings, run: Run = plainly
 ) -> Cascade:
-    """The rotation among the members of the clique, then the translation."""
+    """Find the rotation among the members of the clique, then the translation."""
     scale = positive_scale(scale)
     turned = run("rotation", find_rotation, p, scale, members, settings)
     translation, axes = run("translation", find_translation, p, scale, members, turned.rotation, settings)
@@ -40,7 +40,7 @@ def find_cascade(
 def find_rotation(
     p: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], settings: Settings
 ) -> Rotation:
-    """The rotation of the TIMs among the members (12), as ``settings.rotation`` asks."""
+    """Find the rotation (12) of the TIMs among the members of the clique, as ``settings.rotation`` asks."""
     pairs = chosen_pairs(p, members)
     listed = ListedTims(
         tims(scale * p.src, pairs),
@@ -58,6 +58,6 @@ def find_translation(
     p: Problem, scale: Float[Array, ""], members: Bool[Array, " n"], rotation: Float[Array, "3 3"],
     settings: Settings,
 ) -> tuple[Float[Array, "3"], Bool[Array, "n 3"]]:  # fmt: skip
-    """The vote of each axis (13), and the members behind it."""
+    """Find the translation by the vote of each axis (13), and the members that agree with it."""
     offsets = p.dst - scale * so3.rotate(rotation, p.src)
     return estimate_translation(offsets, p.noise_bound, members, cbar2=p.cbar2, criterion=settings.vote)

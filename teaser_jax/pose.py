@@ -31,7 +31,7 @@ class Pose:
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> Pose:
-        """From ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is not a scaled rotation."""
+        """Make a pose from ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is no scaled rotation."""
         xp = namespace(matrix)
         matrix = xp.asarray(matrix)
         if matrix.shape[-2:] != (4, 4):
@@ -57,14 +57,14 @@ class Pose:
         return so3.quat_from_rotation(self.rotation)
 
     def apply(self, points: Float[AnyArray, "... n 3"]) -> Float[AnyArray, "... n 3"]:
-        """Source points (rows) in the target frame. Raises ValueError on other shapes than (..., n, 3)."""
+        """Carry source points (rows) to the target frame. Raises ValueError unless they are (..., n, 3)."""
         if points.ndim < 2 or points.shape[-1] != 3:
             raise ValueError(f"points have shape {points.shape}: expected (n, 3), one point a row.")
         rotated = so3.rotate(self.rotation, points)
         return self.scale[..., None, None] * rotated + self.translation[..., None, :]
 
     def inverse(self) -> Pose:
-        """The pose from the target to the source frame, ``T_src_dst``."""
+        """Compute the pose from the target to the source frame, ``T_src_dst``."""
         xp = namespace(self.rotation, self.translation, self.scale)
         transposed = xp.swapaxes(self.rotation, -1, -2)
         scale: AnyArray = 1 / self.scale
@@ -72,20 +72,20 @@ class Pose:
         return Pose(transposed, -scale[..., None] * moved, scale)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """Composition: ``(T_c_b @ T_b_a).apply(p) == T_c_b.apply(T_b_a.apply(p))``."""
+        """Compose two poses: ``(T_c_b @ T_b_a).apply(p) == T_c_b.apply(T_b_a.apply(p))``."""
         moved = self.apply(other.translation[..., None, :])[..., 0, :]
         rotation = so3.rotate(self.rotation, other.rotation.swapaxes(-1, -2)).swapaxes(-1, -2)
         return Pose(rotation, moved, self.scale * other.scale)
 
     def as_scipy(self) -> Rotation:
-        """The rotation as ``scipy.spatial.transform.Rotation``."""
+        """Return the rotation as ``scipy.spatial.transform.Rotation``."""
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_matrix(np.asarray(self.rotation))
 
 
 def _check_similarity(matrix: np.ndarray) -> None:
-    """Raise unless each matrix is [s R, t; 0, 1] with s above 0, to one in a thousand."""
+    """Raise ValueError unless each matrix is [s R, t; 0, 1] with s above 0, to one in a thousand."""
     block = matrix[..., :3, :3]
     with np.errstate(invalid="ignore"):
         scale2 = np.cbrt(np.linalg.det(block))[..., None, None] ** 2

@@ -51,7 +51,7 @@ def make_problem(
     confidence: Any = None,
     pairs: Any = None,
 ) -> Problem:
-    """A registration problem from matched points: row i of ``src`` belongs to row i of ``dst``.
+    """Make a registration problem from matched points: row i of ``src`` belongs to row i of ``dst``.
 
     Concrete arrays are checked in full. On traced arrays only shapes and dtypes are checked, and
     rows that cannot be used (NaN, infinity, bounds not above 0) are left out while solving.
@@ -82,7 +82,7 @@ def make_problem(
 
 
 def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
-    """A problem in float64 numpy, from anything that can be read on the host: for ``solve_batch``.
+    """Make a problem in float64 numpy, from anything that can be read on the host: for ``solve_batch``.
 
     Args:
         src, dst: (n, 3) matched points, row i with row i [length].
@@ -109,7 +109,7 @@ def read_problem(
     confidence: Any = None,
     pairs: Any = None,
 ) -> Problem:
-    """A problem whose concrete numbers are left in numpy, in ``dtype`` (None: JAX's choice).
+    """Read a problem and leave its concrete numbers in numpy, in ``dtype`` (None: JAX's choice).
 
     ``make_problem`` and ``host_problem`` read by it. Under jit, jnp would trace what is read and checked
     here.
@@ -147,7 +147,7 @@ def read_problem(
 
 
 def stack_problems(problems: Iterable[Problem]) -> Problem:
-    """Problems of any sizes as one batch: padded to the largest, padding masked.
+    """Stack problems of any sizes as one batch: padded to the largest, padding masked.
 
     Numpy arrays stay numpy. Gradients: exact.
 
@@ -176,7 +176,7 @@ def stack_problems(problems: Iterable[Problem]) -> Problem:
 
 
 def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
-    """The same problem in n rows (and m pairs): added rows are masked and change nothing.
+    """Pad a problem to n rows (and m pairs): added rows are masked and change nothing.
 
     Keeps numpy arrays numpy. Gradients: exact.
     """
@@ -207,7 +207,7 @@ def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
 
 @jax.jit  # one operation for those who call it outside jit
 def clean(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
-    """The problem with unusable rows masked and made harmless, and the count of rows that are not finite.
+    """Mask unusable rows of a problem and make them harmless; count the rows that are not finite.
 
     Whoever solves a problem cleans it once, at the door; the stages receive clean rows and never ask again.
     Values are replaced *before* anything is computed from them, so that neither results nor

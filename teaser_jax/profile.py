@@ -98,7 +98,7 @@ class Stopwatch:
     warm: dict[str, list[float]] = field(default_factory=dict)
 
     def __call__(self, name: str, stage: Callable[..., Any], *inputs: Any, **choices: Any) -> Any:
-        """Run a stage; what it returns."""
+        """Run a stage, note its seconds, and return its output."""
         run = stage if name in self.on_host else _compiled(stage, tuple(choices))
         for repeat in range(self.repeats + 1):
             start = time.perf_counter()
@@ -113,5 +113,5 @@ class Stopwatch:
 
 @lru_cache(maxsize=64)
 def _compiled(stage: Callable[..., Any], choices: tuple[str, ...]) -> Callable[..., Any]:
-    """A stage as a program of its own; what it is asked to choose is static."""
+    """Turn a stage into a program of its own; what it is asked to choose is static."""
     return jax.jit(stage, static_argnames=choices)

@@ -17,12 +17,12 @@ MOST_CONFIDENCE = 1e9
 
 
 def _read(value: Any, name: str) -> AnyArray:
-    """The tracer as it is, or the value as numpy."""
+    """Return a tracer as it is, or read any other value as numpy."""
     return value if is_traced(value) else as_numpy(value, name)
 
 
 def real_numbers(value: Any, name: str) -> AnyArray:
-    """Real numbers as a tracer, or as a numpy array in the machine's own byte order.
+    """Read real numbers as a tracer, or as a numpy array in the machine's own byte order.
 
     Raises:
         ValueError: If the value cannot be read, or holds anything but real numbers.
@@ -42,7 +42,7 @@ def real_numbers(value: Any, name: str) -> AnyArray:
 
 
 def point_rows(value: Any, name: str) -> AnyArray:
-    """Points as (n, 3) numbers. Raises ValueError on any other shape, with the shape and what to do."""
+    """Read points as (n, 3) numbers. Raises ValueError on any other shape, with the shape and what to do."""
     array = real_numbers(value, name)
     shape = array.shape
     if 0 in shape:
@@ -60,7 +60,7 @@ def point_rows(value: Any, name: str) -> AnyArray:
 
 
 def one_a_match(value: Any, name: str, n: int) -> AnyArray:
-    """One number for all matches, or one for each, as (n,). Raises ValueError on any other shape."""
+    """Read one number for all matches, or one for each, as (n,). Raises ValueError on any other shape."""
     array = real_numbers(value, name)
     if array.shape not in ((), (n,)):
         raise ValueError(f"{name} has shape {array.shape}: expected one number or one a match, ({n},).")
@@ -68,7 +68,7 @@ def one_a_match(value: Any, name: str, n: int) -> AnyArray:
 
 
 def positive_number(value: Any, name: str) -> AnyArray:
-    """One finite number above 0, if it is known. Raises ValueError on anything else."""
+    """Read one number, finite and above 0 where it is known. Raises ValueError on anything else."""
     array = real_numbers(value, name)
     if array.shape != ():
         raise ValueError(f"{name} has shape {array.shape}: expected one number.")
@@ -78,7 +78,7 @@ def positive_number(value: Any, name: str) -> AnyArray:
 
 
 def known_scale(value: Any) -> AnyArray:
-    """The known scale, one number above 0. Raises ValueError on anything else."""
+    """Read the known scale, one number above 0. Raises ValueError on anything else."""
     array = _read(value, "scale")
     if array.dtype.kind in "US":
         raise ValueError(f"scale is the text '{array}': give a number, or pass scale=None to estimate it.")
@@ -86,7 +86,7 @@ def known_scale(value: Any) -> AnyArray:
 
 
 def truth_values(value: Any, n: int) -> AnyArray:
-    """The mask of the matches, (n,) truth values. Raises ValueError on anything else."""
+    """Read the mask of the matches, (n,) truth values. Raises ValueError on anything else."""
     array = _read(value, "mask")
     if array.shape != (n,) or array.dtype.kind != "b":
         convertible = array.shape == (n,) and array.dtype.kind in "iuf"
@@ -98,7 +98,7 @@ def truth_values(value: Any, n: int) -> AnyArray:
 
 
 def row_pairs(value: Any, n: int) -> AnyArray:
-    """Pairs of row numbers, (m, 2), also from a ``networkx.Graph``. Raises ValueError on anything else."""
+    """Read pairs of row numbers, (m, 2), also of a ``networkx.Graph``. Raises ValueError on anything else."""
     if hasattr(value, "edges") and hasattr(value, "nodes"):  # a networkx.Graph
         value = np.asarray(list(value.edges()), dtype=object).reshape(-1, 2)
         if not all(isinstance(x, (int, np.integer)) for x in value.ravel()):
@@ -184,7 +184,7 @@ def _check_resolution(src: Any, dst: Any, noise_bound: Any, usable: Any, dtype: 
 
 
 def _lonely_row(src: Any, dst: Any, usable: Any, largest: float) -> str:
-    """What to say where a single row is far beyond the others; otherwise nothing."""
+    """Name the row to mask where a single one is far beyond the others; otherwise say nothing."""
     reach = np.maximum(np.abs(src[usable]).max(axis=1), np.abs(dst[usable]).max(axis=1))
     row = np.arange(len(src))[usable][np.argmax(reach)]
     usual = float(np.median(reach.astype(np.float64)))
@@ -194,12 +194,12 @@ def _lonely_row(src: Any, dst: Any, usable: Any, largest: float) -> str:
 
 
 def finite_rows(src: Any, dst: Any, mask: Any) -> np.ndarray | slice:
-    """What picks the rows of finite numbers: a slice, which copies nothing, where that is all of them."""
+    """Make an index of the finite rows under the mask: a slice, which copies nothing, if these are all."""
     if np.all(mask) and np.isfinite(src).all() and np.isfinite(dst).all():
         return slice(None)
     return np.asarray(mask) & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
 
 
 def extent(points: Any) -> float:
-    """The largest coordinate of points, signs apart [length]."""
+    """Find the largest coordinate of points, signs apart [length]."""
     return float(max(points.max(), -points.min()))

@@ -21,7 +21,7 @@ from teaser_jax.stages.translation import translation_of_points
 
 
 def refit(problem: Problem, selection: Selection) -> Pose:
-    """The pose from the chosen sets, in closed form: the smooth half of ``solve``.
+    """Compute the pose from the chosen sets, in closed form: the smooth half of ``solve``.
 
     Refined selections give the weighted similarity fit over ``inliers``; others give (11) - (13)
     on the frozen sets with binary weights. Weights are confidence_i / beta_i^2.
@@ -63,7 +63,7 @@ def refit(problem: Problem, selection: Selection) -> Pose:
 
 
 def check_problem(problem: Any) -> None:
-    """Check that this is one problem. Raises ValueError."""
+    """Check that ``problem`` is one problem. Raises ValueError."""
     if not isinstance(problem, Problem):
         raise ValueError(
             f"received {type(problem).__name__} for a problem: make one with make_problem(src, dst, "
@@ -76,14 +76,14 @@ def check_problem(problem: Any) -> None:
 
 
 def joint_pose(p: Problem, selection: Selection) -> Pose:
-    """The weighted similarity fit to the inliers of a refined selection; the problem is clean."""
+    """Compute the weighted similarity fit to the inliers of a refined selection; the problem is clean."""
     weights = jnp.where(selection.inliers, p.confidence / p.noise_bound**2, 0)
     fit = fit_similarity(p.src, p.dst, weights, p.scale)
     return _constant_if_ambiguous(fit.pose, fit.correlation)
 
 
 def cascade_pose(p: Problem, selection: Selection) -> Pose:
-    """The paper's plain cascade on the same sets: scale, rotation, translation; the problem is clean."""
+    """Compute the paper's plain cascade on chosen sets of a clean problem: scale, rotation, translation."""
     if p.scale is not None:
         scale = p.scale
     else:
@@ -99,23 +99,23 @@ def cascade_pose(p: Problem, selection: Selection) -> Pose:
 
 
 def positive_scale(scale: Float[Array, ""]) -> Float[Array, ""]:
-    """The scale, or 1 where nothing could vote: what follows must stay finite."""
+    """Return the scale, or 1 where nothing could vote: what follows must stay finite."""
     return jnp.where(scale > 0, scale, 1)
 
 
 def chosen_pairs(p: Problem, members: Bool[Array, " n"]) -> Int[Array, "k 2"]:
-    """The pairs whose TIMs the rotation rests on: those given, or the ring of the members."""
+    """List the pairs whose TIMs the rotation rests on: those given, or the ring of the members."""
     return ring_pairs(members) if p.pairs is None else p.pairs
 
 
 def _constant_if_ambiguous(pose: Pose, correlation: Float[Array, "3 3"]) -> Pose:
-    """The pose; it has no derivative where its rotation could as well be another: none means anything."""
+    """Stop the derivative of a pose whose rotation could as well be another: there it means nothing."""
     ambiguous = so3.is_ambiguous(correlation)
     return jax.tree.map(lambda x: jnp.where(ambiguous, lax.stop_gradient(x), x), pose)
 
 
 def _correlation_of(p: Problem, members: Bool[Array, " n"], chosen: Chosen) -> Float[Array, "3 3"]:
-    """What decides the closed-form rotation (12) on the chosen TIMs; the scale does not matter to it."""
+    """Compute the correlation that decides the rotation (12) of the chosen TIMs, whatever the scale."""
     if chosen.dtype == jnp.uint32:
         return correlation_of_pairs(p.src, p.dst, p.noise_bound, p.confidence, chosen)
     pairs = chosen_pairs(p, members)

@@ -51,7 +51,7 @@ class Registration:
 
     @classmethod
     def of(cls, problem: Problem, solution: Solution) -> Registration:
-        """The answer to a problem, with copies of what was asked.
+        """Make the answer to a problem, with copies of what was asked.
 
         A certificate may be asked for later, when the caller's arrays hold something else.
         """

@@ -87,7 +87,7 @@ class Settings:
 
 
 def as_record(name: str, choice: Any, known: dict[str, Any]) -> Any:
-    """The record that a name stands for; anything else is a record, or a placeholder of JAX, and passes.
+    """Return the record that a name stands for; anything else, a record or a placeholder of JAX, passes.
 
     Raises:
         ValueError: If the name is unknown.

@@ -27,7 +27,7 @@ JACOBI_SWEEPS = 6
 def rotate(
     rotation: Float[AnyArray, "... 3 3"], points: Float[AnyArray, "... n 3"]
 ) -> Float[AnyArray, "... n 3"]:
-    """Rows of ``points`` turned by ``rotation``; full precision on every backend.
+    """Turn the rows of ``points`` by ``rotation``; full precision on every backend.
 
     Gradients: exact in both arguments.
     """
@@ -38,14 +38,14 @@ def rotate(
 
 
 def hat(vector: Float[AnyArray, "3"]) -> Float[Array, "3 3"]:
-    """The skew matrix with ``hat(v) @ x = cross(v, x)``."""
+    """Make the skew matrix with ``hat(v) @ x = cross(v, x)``."""
     x, y, z = vector
     zero = jnp.zeros_like(x)
     return jnp.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 def axial(matrix: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """``vee(G - G^T)``: twice the axis vector of the skew part."""
+    """Compute ``vee(G - G^T)``: twice the axis vector of the skew part."""
     return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
 
 
@@ -67,7 +67,7 @@ def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
 def singular_frames(
     matrix: Float[Array, "3 3"],
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], Float[Array, "3 3"]]:
-    """``matrix = U diag(s) V^T`` with *proper* rotations U, V and s_1 >= s_2 >= |s_3|.
+    """Decompose ``matrix = U diag(s) V^T`` with *proper* rotations U, V and s_1 >= s_2 >= |s_3|.
 
     The third axes come from cross products, so U and V are rotations whatever the rank, and the
     sign of the determinant sits in s_3. LAPACK compiles fastest and is as fast as anything for
@@ -112,7 +112,7 @@ def _leading_axes_lapack(matrix: Float[Array, "3 3"]) -> Axes:
 
 
 def leading_axes_jacobi(matrix: Float[Array, "3 3"]) -> Axes:
-    """The two leading left and right axes (rows) by one-sided Jacobi.
+    """Find the two leading left and right axes (rows) by one-sided Jacobi.
 
     Turns pairs of columns until they are orthogonal. Rolling the columns after each turn visits
     the pairs in order with a loop body of one turn, which keeps the program small.
@@ -156,7 +156,7 @@ def _reject(vector: Float[Array, "3"], axis: Float[Array, "3"]) -> Float[Array, 
 
 
 def largest_eigenvalue(matrix: Float[Array, "3 3"]) -> Float[Array, ""]:
-    """The largest eigenvalue of a symmetric matrix, in closed form (Smith, Comm. ACM 1961).
+    """Compute the largest eigenvalue of a symmetric matrix, in closed form (Smith, Comm. ACM 1961).
 
     Gradients: none worth having where eigenvalues meet.
     """
@@ -170,7 +170,7 @@ def largest_eigenvalue(matrix: Float[Array, "3 3"]) -> Float[Array, ""]:
 
 @jax.custom_jvp
 def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The rotation R that maximises tr(R^T H), the solution of Wahba's problem.
+    """Find the rotation R that maximises tr(R^T H), the solution of Wahba's problem.
 
     Args:
         matrix: H = sum_k w_k b_k a_k^T for pairs b_k ~ R a_k.
@@ -203,7 +203,7 @@ def _nearest_rotation_jvp(primals: tuple, tangents: tuple) -> tuple:
 def _inverse(
     matrix: Float[Array, "3 3"], rotation: Float[Array, "3 3"]
 ) -> tuple[Float[Array, "3 3"], Bool[Array, ""]]:
-    """The inverse of tr(M) I - M, and whether there is none; it is zero then."""
+    """Invert tr(M) I - M, for M = R^T H, and tell whether there is no inverse; it is zero then."""
     # Third powers follow: in units of the matrix none of them overflows.
     size = lax.stop_gradient(jnp.max(jnp.abs(matrix)))
     size = jnp.where(size > 0, size, 1)
@@ -219,13 +219,13 @@ def _inverse(
 
 
 def is_ambiguous(matrix: Float[Array, "3 3"]) -> Bool[Array, ""]:
-    """Whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirror image."""
+    """Tell whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirroring."""
     matrix = lax.stop_gradient(matrix)
     return _inverse(matrix, nearest_rotation(matrix))[1]
 
 
 def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "..."]:
-    """Angle of a rotation in [0, pi] [rad], accurate near 0 and near pi.
+    """Measure the angle of a rotation in [0, pi] [rad], accurate near 0 and near pi.
 
     Gradients: use only away from 0 and pi, where the angle has kinks.
     """
@@ -243,7 +243,7 @@ def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "...
 
 
 def quat_from_rotation(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "... 4"]:
-    """Unit quaternion (x, y, z, w), w >= 0, of a rotation matrix.
+    """Compute the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix.
 
     The four classic branches are all evaluated and the best conditioned one is taken, so the
     result is accurate everywhere and has no data-dependent control flow.
@@ -269,7 +269,7 @@ def quat_from_rotation(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, 
 
 
 def rotation_from_quat(quat: Float[AnyArray, "... 4"]) -> Float[AnyArray, "... 3 3"]:
-    """Rotation matrix of a quaternion (x, y, z, w), which need not have unit length."""
+    """Compute the rotation matrix of a quaternion (x, y, z, w), which need not have unit length."""
     xp = namespace(quat)
     x, y, z, w = (quat[..., k] / xp.sqrt(xp.sum(quat * quat, axis=-1)) for k in range(4))
     flat = xp.stack(
@@ -284,5 +284,5 @@ def rotation_from_quat(quat: Float[AnyArray, "... 4"]) -> Float[AnyArray, "... 3
 
 
 def random_rotation(key: Array) -> Float[Array, "3 3"]:
-    """A rotation drawn uniformly from SO(3): a normalised Gaussian quaternion."""
+    """Draw a rotation uniformly from SO(3): a normalised Gaussian quaternion."""
     return rotation_from_quat(jax.random.normal(key, (4,)))

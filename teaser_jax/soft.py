@@ -79,7 +79,7 @@ def soft_solve(
     gnc_mu: Float[Array, ""] | float = 1.0,
     iterations: int = 200,
 ) -> SoftSolution:
-    """The stationary point of the GNC-TLS cost at a fixed control, next to the answer of ``solve``.
+    """Find the stationary point of the GNC-TLS cost at a fixed control, next to the answer of ``solve``.
 
     Minimises sum_i confidence_i rho_mu(|b_i - s R a_i - t|^2 / beta_i^2) over all matches and all
     unknowns, by reweighted similarity fits, none of which can raise the cost. Works under jit, vmap and
@@ -137,7 +137,7 @@ def soft_solve(
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _stationary(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Array, ""], Bool[Array, ""]]:
-    """The pose, whether the fits settled on it, and whether the cost curves upwards there on all sides."""
+    """Find the pose, and tell whether the fits settled there and the cost curves upwards on all sides."""
     pose, settled = _descend(data, start, iterations)
     curvature = _curvature(data, pose)
     slope = jax.grad(_energy)(jnp.zeros_like(curvature.unit), data, pose)
@@ -151,7 +151,7 @@ def _stationary(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[A
 
 
 def _descend(data: _Data, start: Pose, iterations: int) -> tuple[Pose, Bool[Array, ""]]:
-    """Fit with the weights of the fit before until these stand still; the last pose, and whether they did."""
+    """Fit the pose with the weights of the fit before until these stand still, and tell whether they did."""
 
     class Descent(NamedTuple):
         pose: Pose
@@ -188,7 +188,7 @@ class _Curvature(NamedTuple):
 
 
 def _energy(step: Float[Array, " d"], data: _Data, pose: Pose) -> Float[Array, ""]:
-    """Half the softened cost after a step from the pose: a turn and a shift about the middle, log scale."""
+    """Compute half the softened cost after a step from a pose: turn and shift about the middle, log scale."""
     rotation = pose.rotation @ _turn(step[:3])
     scale = pose.scale if data.scale is None else data.scale
     if data.scale is None:
@@ -201,15 +201,15 @@ def _energy(step: Float[Array, " d"], data: _Data, pose: Pose) -> Float[Array, "
 
 
 def _turn(w: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The rotation by a small vector, to second order: all that a second derivative at zero sees."""
+    """Compute the rotation by a small vector, to second order: all that a second derivative at zero sees."""
     skew = so3.hat(w)
     return jnp.eye(3, dtype=w.dtype) + skew + 0.5 * skew @ skew
 
 
 def _middle(data: _Data, pose: Pose) -> Float[Array, "3"]:
-    """About which poses are varied: about a far origin, turns and shifts would all but coincide.
+    """Find the point about which poses are varied: about a far one, turns and shifts would all but coincide.
 
-    Of the matches that count at the pose: a wrong one may be as far away as it likes.
+    It is the middle of the matches that count at the pose: a wrong one may be as far away as it likes.
     """
     data, pose = lax.stop_gradient((data, pose))
     r2 = squared_residuals(pose, data.src, data.dst, data.noise_bound)
@@ -233,13 +233,13 @@ def _curvature(data: _Data, pose: Pose) -> _Curvature:
 
 
 def _solved(curvature: _Curvature, slope: Float[Array, " d"]) -> Float[Array, " d"]:
-    """The step to which a slope belongs; none where the cost does not determine it."""
+    """Find the step to which a slope belongs; zero where the cost does not determine it."""
     scaled = jnp.where(curvature.determined, slope, 0) * curvature.unit
     return curvature.unit * jnp.linalg.solve(curvature.matrix, scaled)
 
 
 def _moved(pose: Pose, step: Float[Array, " d"], data: _Data) -> Pose:
-    """The pose after a small step about the middle."""
+    """Move a pose by a small step about the middle of the matches that count."""
     half_turn = jnp.concatenate([0.5 * step[:3], jnp.ones_like(step[:1])])
     rotation = pose.rotation @ so3.rotation_from_quat(half_turn)
     scale = pose.scale if data.scale is not None else pose.scale * jnp.exp(step[6])

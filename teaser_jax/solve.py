@@ -43,7 +43,7 @@ class Graph(NamedTuple):
 
 
 def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
-    """Robust registration of matched points: TEASER++, then a joint refinement.
+    """Register matched points robustly: TEASER++, then a joint refinement.
 
     A pure function: works under jit, vmap, grad and lax.scan, on one device (the exact clique
     calls the host once a batch). Follows the dtype of the problem; scale and translation vote in
@@ -73,7 +73,7 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
 
 
 def select(problem: Problem, settings: Settings = Settings()) -> Selection:
-    """Which measurements to trust: the discrete half of ``solve``, without its verdict.
+    """Choose which measurements to trust: the discrete half of ``solve``, without its verdict.
 
     ``refit(problem, select(problem))`` is the pose of ``solve(problem)``.
 
@@ -92,20 +92,20 @@ def select(problem: Problem, settings: Settings = Settings()) -> Selection:
 
 
 def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Int[Array, ""]]:
-    """The problem, checked and clean, and how many rows are not finite."""
+    """Check and clean a problem, and count the rows that are not finite."""
     check_problem(problem)
     check_settings(settings)
     return clean(problem)
 
 
 def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
-    """The scale and the consistency graph of a clean problem; edges are tested in ``edge_dtype``."""
+    """Find the scale and the consistency graph of a clean problem; edges are tested in ``edge_dtype``."""
     scale, scale_pairs = run("scale", find_scale, p, settings)
     return Graph(scale, scale_pairs, run("consistency graph", find_edges, p, scale, dtype=edge_dtype))
 
 
 def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScalePairs | None]:
-    """The known scale, or the vote (11) and the pairs that agree with it."""
+    """Return the known scale, or find it by the vote (11), with the pairs that agree with it."""
     if p.scale is not None:
         return p.scale, None
     return estimate_scale(
@@ -115,7 +115,7 @@ def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScaleP
 
 
 def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> UInt32[Array, "n w"]:
-    """The consistency graph at a scale, tested in ``dtype`` (None: that of the problem)."""
+    """Find the consistency graph at a scale, tested in ``dtype`` (None: that of the problem)."""
     src, dst, noise_bound, scale, cbar2 = (
         x.astype(dtype or p.src.dtype) for x in (p.src, p.dst, p.noise_bound, scale, p.cbar2)
     )
@@ -126,9 +126,10 @@ def choose(
     p: Problem, graph: Graph, clique: Clique, settings: Settings,
     *, cascade: Run = find_cascade, run: Run = plainly,
 ) -> tuple[Selection, Bool[Array, ""]]:  # fmt: skip
-    """Which measurements of a clean problem to trust, given the clique, and whether every iteration settled.
+    """Choose which measurements to trust, given the clique, and tell whether every iteration settled.
 
-    ``cascade`` finds rotation and translation. Gradients: none; the caller stops the inputs.
+    The problem is clean; ``cascade`` finds rotation and translation. Gradients: none; the caller stops the
+    inputs.
     """
     members = clique.members & p.mask
     found = cascade(p, graph.scale, members, settings, run)
@@ -143,7 +144,7 @@ def choose(
 def find_inliers(
     p: Problem, start: Pose, refinement: Refinement
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
-    """The consensus set where the joint cost (6) stops falling, and whether it did stop."""
+    """Find the consensus set where the joint cost (6) stops falling, and tell whether it did stop."""
     return refine(
         start, p.src, p.dst, p.noise_bound, p.mask,
         scale=p.scale, cbar2=p.cbar2, iterations=refinement.iterations,
@@ -154,7 +155,7 @@ def conclude(
     p: Problem, excluded: Int[Array, ""], graph: Graph, clique: Clique, settings: Settings,
     *, cascade: Run = find_cascade, run: Run = plainly,
 ) -> Solution:  # fmt: skip
-    """Everything behind the clique: the sets, the pose, and whether to trust it."""
+    """Find what lies behind the clique: the sets, the pose, and whether to trust it."""
     frozen, graph, clique = lax.stop_gradient((p, graph, clique))
     selection, settled = choose(frozen, graph, clique, settings, cascade=cascade, run=run)
     pose = run("refit", joint_pose if settings.refine else cascade_pose, p, selection)
@@ -179,7 +180,7 @@ def judge(
     p: Problem, pose: Pose, selection: Selection, edge_bits: UInt32[Array, "n w"], settled: Bool[Array, ""],
     settings: Settings,
 ) -> Int[Array, ""]:  # fmt: skip
-    """The status of a pose, from what speaks for it and against it."""
+    """Decide the status of a pose, from what speaks for it and against it."""
     return status_of(
         evidence_of(
             p, pose, selection.inliers, selection.clique, edge_bits,

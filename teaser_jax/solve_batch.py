@@ -31,7 +31,7 @@ def solve_batch(
     chunk_size: int | None = None,
     progress: bool = False,
 ) -> list[Solution] | Solution:
-    """``solve`` for thousands of problems, on every device there is; outside jit, in float64.
+    """Solve thousands of problems as ``solve`` does, on every device there is; outside jit, in float64.
 
     Problems are sorted by size, padded to the sizes of ``register`` and solved some at a time by a few
     compiled programs a size: one up to the clique, and one for each of up to four classes of clique sizes.
@@ -64,7 +64,7 @@ def solve_batch(
     chunk_size = _check_choices(settings, mesh, chunk_size)
 
     def solved(groups: list[Group], assemble: Callable[[Iterator[Chunk]], Any]) -> Any:
-        """What is assembled of the chunks of this process; None if it has no device or no problem."""
+        """Solve the chunks of this process and assemble them; None if it has no device or no problem."""
         devices = local_mesh(mesh)
         if devices is None or not groups:
             return None
@@ -94,7 +94,7 @@ def solve_batch(
 
 
 def _check_choices(settings: Any, mesh: Any, chunk_size: Any) -> int | None:
-    """Check what is asked for beside the problems; the size of the chunks. Raises ValueError."""
+    """Check what is asked for beside the problems, and return the size of the chunks. Raises ValueError."""
     check_settings(settings)
     if settings.rotation.needs_host:
         raise ValueError('Settings(rotation="sdp") is solved on the host, one by one: use solve or register.')
@@ -108,17 +108,17 @@ def _check_choices(settings: Any, mesh: Any, chunk_size: Any) -> int | None:
 
 
 def read_list(problems: Sequence[Any]) -> list[Problem]:
-    """The problems in float64 numpy, each checked. Raises ValueError with the number of the bad one."""
+    """Read problems in float64 numpy, and check each. Raises ValueError with the number of the bad one."""
     return [_read(problem, 1, f"problems[{k}]") for k, problem in enumerate(problems)]
 
 
 def read_stack(stack: Problem) -> Problem:
-    """A stacked problem in float64 numpy. Raises ValueError if its arrays do not belong together."""
+    """Read a stacked problem in float64 numpy. Raises ValueError if its arrays do not belong together."""
     return _read(stack, 2, "the stacked problem")
 
 
 def _read(problem: Any, axes: int, name: str) -> Problem:
-    """A problem with so many axes in front of its coordinates, in float64 numpy. Raises ValueError."""
+    """Read a problem with so many axes in front of its coordinates, in float64 numpy. Raises ValueError."""
     if not isinstance(problem, Problem):
         raise ValueError(
             f"{name} is of type {type(problem).__name__}: expected a Problem, as from make_problem."

@@ -130,7 +130,7 @@ def _traced(
     src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any,
     method: RotationMethod, options: Options, certified: bool,
 ) -> RotationSolution:  # fmt: skip
-    """Solve in the program that is being traced."""
+    """Find the rotation in the program that is being traced."""
     if method.needs_host:
         raise ValueError("method='sdp' calls a conic solver and runs outside jit only: take 'global'.")
     k = np.shape(src)[0]
@@ -154,7 +154,7 @@ def _on_host(
     src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any,
     method: RotationMethod, options: Options, certified: bool,
 ) -> RotationSolution:  # fmt: skip
-    """Solve outside jit, in float64."""
+    """Find the rotation outside jit, in float64."""
     k = np.shape(src)[0]
     measurements = read_measurements(src, dst, noise_bound, cbar2, mask)
     rounds = options.rounds(k)
@@ -171,18 +171,18 @@ def _on_host(
 
 
 def _gnc_of(method: RotationMethod) -> Gnc:
-    """How graduated non-convexity goes, with which every method begins."""
+    """Return the record of graduated non-convexity, with which every method begins."""
     return method if isinstance(method, Gnc) else method.gnc
 
 
 def _tries_pairs(method: RotationMethod) -> bool:
-    """Whether a method goes on to search all pairs of measurements."""
+    """Tell whether a method goes on to search all pairs of measurements."""
     return not isinstance(method, Gnc)
 
 
 @partial(jax.jit, static_argnames="all_pairs", compiler_options=QUICKLY)
 def _searched(measurements: HostMeasurements, gnc: Gnc, *, all_pairs: bool) -> RotationSolution:
-    """Search in one compiled program."""
+    """Search for the rotation in one compiled program."""
     return _search(**measurements._asdict(), gnc=gnc, all_pairs=all_pairs)
 
 

@@ -48,7 +48,7 @@ class Uncertainty:
 def covariance(
     problem: Problem, solution: Solution, sigma: Any = None, *, convention: Convention = "right"
 ) -> Uncertainty:
-    """Covariance of the pose, to first order in the noise, the chosen matches being right.
+    """Compute the covariance of the pose, to first order in the noise, the chosen matches being right.
 
     Errors of the targets are taken as independent, with the same deviation in all directions; noise of
     the source counts as noise of the target, s times as large. The derivative of ``refit`` carries them to
@@ -106,7 +106,7 @@ def covariance(
 def pose_difference(
     pose: Pose, truth: Pose, *, convention: Convention = "right", with_scale: bool = False
 ) -> Float[Array, " d"]:
-    """The error of a pose in the coordinates of ``covariance``, with the rotation's logarithm in full.
+    """Compute the error of a pose in the coordinates of ``covariance``, the rotation's logarithm in full.
 
     ``error @ information @ error`` is the normalised error squared, which should follow chi^2.
 
@@ -206,7 +206,10 @@ def _middle(p: Problem, inliers: Bool[Array, " n"]) -> Float[Array, "3"]:
 
 
 def _moved_origin(shift: Float[Array, "3"], d: int) -> Float[Array, "d d"]:
-    """From errors of a pose at a point to those at the origin, ``shift`` before it, in axes of the source."""
+    """Make the matrix that takes errors of a pose at a point to those at the origin.
+
+    The origin lies ``shift`` before the point, in the axes of the source.
+    """
     found = jnp.eye(d, dtype=shift.dtype).at[3:6, :3].set(so3.hat(shift))
     return found if d == 6 else found.at[3:6, 6].set(-shift)
 
@@ -216,7 +219,7 @@ def _product(a: Array, b: Array) -> Array:
 
 
 def _coordinates(pose: Pose, about: Pose, problem: Problem) -> Float[Array, " d"]:
-    """Small errors of a pose about another, in the axes of the source: turn, shift, log scale if unknown."""
+    """Compute small errors of a pose about another, in source axes: turn, shift, log scale if unknown."""
     between = jnp.einsum("ji,jk->ik", about.rotation, pose.rotation, precision=jax.lax.Precision.HIGHEST)
     turn = 0.5 * so3.axial(between)
     shift = (pose.translation - about.translation) @ about.rotation
@@ -225,7 +228,7 @@ def _coordinates(pose: Pose, about: Pose, problem: Problem) -> Float[Array, " d"
 
 
 def _change(pose: Pose, d: int, convention: Convention) -> Float[Array, "d d"]:
-    """The matrix from our coordinates to those of a convention."""
+    """Make the matrix from our coordinates to those of a convention."""
     r, eye, zero = pose.rotation, jnp.eye(3, dtype=pose.rotation.dtype), jnp.zeros_like(pose.rotation)
     blocks = {
         "right": [[eye, zero], [zero, eye]],
@@ -237,7 +240,7 @@ def _change(pose: Pose, d: int, convention: Convention) -> Float[Array, "d d"]:
 
 
 def _estimated(p: Problem, solution: Solution) -> Float[Array, " n"]:
-    """Deviations in proportion to the bounds. Of 3 m residuals the pose has taken six or seven."""
+    """Estimate deviations in proportion to the bounds. Of 3 m residuals the pose has taken six or seven."""
     r2 = squared_residuals(jax.tree.map(jnp.asarray, solution.pose), p.src, p.dst, p.noise_bound)
     m = jnp.sum(solution.inliers, dtype=jnp.int32).astype(p.src.dtype)
     left = 3 * m - (6 if p.scale is not None else 7)

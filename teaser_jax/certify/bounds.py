@@ -21,17 +21,17 @@ class Bound(NamedTuple):
 
     @classmethod
     def below(cls, value: float, limit: float, reason: str = "") -> Bound:
-        """A bound that says something if it lies below what is always true."""
+        """Make a bound; it says something if it lies below ``limit``, which always holds."""
         return cls(float(value), bool(value < limit), reason)
 
     @classmethod
     def unknown(cls, reason: str) -> Bound:
-        """The place of a bound that cannot be computed."""
+        """Make what stands for a bound that cannot be computed: NaN, with the reason."""
         return cls(np.nan, False, reason)
 
     @property
     def words(self) -> str:
-        """The number, and where it says nothing the reason."""
+        """The number of the bound, and where it says nothing the reason."""
         number = f"{self.value:.3g}"
         return number if self.informative else f"{number} ({self.reason or 'says nothing'})"
 
@@ -87,5 +87,5 @@ class InlierSet:
 
     @property
     def matrix_limit(self) -> float:
-        """What |s R - s R0|_F never exceeds, for any two rotations."""
+        """A number that |s R - s R0|_F never exceeds, for any two rotations."""
         return 2 * np.sqrt(2) * self.scale

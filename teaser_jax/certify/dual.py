@@ -59,7 +59,7 @@ def dual_matrix(m: Measurements, dual: Dual) -> Float[Array, "n4 n4"]:
 
 
 def dual_of(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Dual:
-    """Read the free numbers of a matrix M of the family; what does not belong to it is dropped."""
+    """Read the free numbers of Delta off a matrix M; what does not belong to the family is dropped."""
     n = matrix.shape[0] // 4
     blocks = (matrix - cost_matrix(m)).reshape(n, 4, n, 4)
     skew = 0.5 * (blocks - jnp.transpose(blocks, (0, 3, 2, 1)))
@@ -150,12 +150,12 @@ def _coupling(m: Measurements) -> Float[Array, "k k 3"]:
 def _outlier_correction(m: Measurements) -> Float[Array, "k 3 3"]:
     """Find what turns c^2 I / 2 in the block of an outlier into (n n^T + p p^T / sin^2(phi / 2)) c^2 / 2.
 
-    n halves the angle phi between the two vectors and p is normal to both. For all others it is zero.
+    n halves the angle phi between the two vectors and p is normal to both. For others the correction is zero.
     """
     eye = jnp.eye(3, dtype=m.src.dtype)
 
     def directions(x: Array) -> tuple[Array, Array]:
-        """Unit vectors along the rows, and which rows are long enough to have one."""
+        """Compute unit vectors along the rows, and tell which rows are long enough to have one."""
         length = jnp.sqrt(jnp.sum(x * x, axis=1))
         some = length > 1e-6
         return x / jnp.where(some, length, 1)[:, None], some

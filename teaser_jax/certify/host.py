@@ -45,7 +45,7 @@ class Pending(NamedTuple):
 
 
 class ClosedForm(NamedTuple):
-    """What the closed form came to.
+    """What the closed form came to: a certificate, and what is left to do.
 
     Attributes:
         certificate: What it proves.
@@ -186,7 +186,7 @@ def _bounded(pending: Pending) -> Certificate:
 
 @partial(jax.jit, compiler_options=QUICKLY)
 def _iterated(pending: Pending, iterations: Int[Array, ""]) -> Certificate:
-    """Go on by the splitting, and read the certificate off where it ends."""
+    """Continue a proof by the splitting, and read the certificate off where it ends."""
     attempt = iterate(pending.claim, pending.attempt, iterations)
     lowest = lowest_if_unproved(pending.claim, attempt)
     return read_off(pending.frame, pending.claim, attempt, lowest)
@@ -200,6 +200,6 @@ def _published(
     *,
     iterations: int,
 ) -> Certificate:
-    """Certify by Algorithm 3 as published."""
+    """Certify a rotation by Algorithm 3 as published."""
     m, frame, constant = in_frame_of(rotation, **measurements._asdict())
     return prove(m, frame, constant, tolerance, iterations=iterations, method="reference")

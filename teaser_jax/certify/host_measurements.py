@@ -55,7 +55,7 @@ def read_measurements(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: An
 
 
 def padded(measurements: HostMeasurements, size: int) -> HostMeasurements:
-    """Append rows of padding until there are ``size`` rows."""
+    """Append rows of padding to measurements until there are ``size`` rows."""
 
     def longer(x: np.ndarray, fill: float) -> np.ndarray:
         return np.concatenate([x, np.full((size - len(x), *x.shape[1:]), fill, x.dtype)])
@@ -70,7 +70,7 @@ def padded(measurements: HostMeasurements, size: int) -> HostMeasurements:
 
 
 def without_padding(measurements: HostMeasurements) -> HostMeasurements:
-    """Cut the rows of padding off."""
+    """Cut the rows of padding off the measurements."""
     k = measurements.measured
     return measurements._replace(
         src=measurements.src[:k],

@@ -45,7 +45,7 @@ def checked_options(
     method: CertifyMethod,
     max_measurements: int | np.integer,
 ) -> Options:
-    """Check what all who certify are asked; the method is checked where it has its name.
+    """Check the options that all ways to certify share; the method is checked where it has its name.
 
     Raises:
         ValueError: A tolerance that is not between 0 and 1, or caps that are no whole numbers.
@@ -63,7 +63,7 @@ def default_iterations(k: int) -> int:
 
 
 def _between_0_and_1(value: Any) -> float:
-    """Read a tolerance, or raise ValueError."""
+    """Read a tolerance between 0 and 1, or raise ValueError."""
     if not isinstance(value, Real) and np.shape(value) != () or not 0 < value < 1:
         raise ValueError(f"tolerance is {value!r}: expected a number between 0 and 1.")
     return float(value)

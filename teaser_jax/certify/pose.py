@@ -139,7 +139,7 @@ def on_host(records: Records) -> Records:
 
 
 def _nothing_proved_where(too_many: Bool[Array, ""], found: Certificate) -> Certificate:
-    """Take every claim back where measurements were left out."""
+    """Take every claim of a certificate back where measurements were left out."""
     nothing = replace(
         found,
         lower_bound=jnp.zeros_like(found.lower_bound),
@@ -153,7 +153,7 @@ def _nothing_proved_where(too_many: Bool[Array, ""], found: Certificate) -> Cert
 
 
 def with_gaps(found: Certificate, problem: Problem, solution: Solution) -> Certificate:
-    """Add what the bound on the clique says of every pose whatever: its inliers are a clique, too."""
+    """Add what the bound on the clique says of every pose: the inliers of any pose are a clique, too."""
     p = problem
     xp = namespace(p.src, solution.clique_upper_bound)
     most = xp.asarray(solution.clique_upper_bound)

@@ -90,7 +90,7 @@ def direct(claim: Claim) -> Attempt:
 
 
 def iterate(claim: Claim, attempt: Attempt, iterations: Int[Array, ""] | int) -> Attempt:
-    """Go on by the splitting from the closed form without the correction, in which ``attempt`` ended."""
+    """Continue ``attempt`` by the splitting: it ended in the closed form without the correction."""
     found = split(claim.polished, attempt.matrix, claim.shift, iterations=iterations)
     return Attempt(found.matrix, found.proved, found.rounds, jnp.int32(CertifiedBy.SPLITTING))
 
@@ -114,7 +114,7 @@ def prove(
     iterations: int,
     method: CertifyMethod,
 ) -> Certificate:
-    """Take all steps in one program, for jit and vmap.
+    """Take all steps of a proof in one program, for jit and vmap.
 
     Args:
         m: The measurements, in the frame of the rotation that was given.
@@ -208,7 +208,7 @@ def _status(
     some: Bool[Array, ""],
     error: Float[Array, ""],
 ) -> Int[Array, ""]:
-    """Choose the status; of all that hold the last in the list counts."""
+    """Choose the status of a certificate; of all that hold the last in the list counts."""
     status = jnp.int32(CertificateStatus.UNKNOWN)
     for holds, what in (
         (claim.shift <= 2 * error, CertificateStatus.UNDECIDABLE),
@@ -224,7 +224,7 @@ def _status(
 def _others(
     claim: Claim, matrix: Float[Array, "n4 n4"], error: Float[Array, ""]
 ) -> tuple[Bool[Array, ""], Float[Array, ""]]:
-    """Ask whether M is positive away from the candidate x, and how far from it an equal rotation can be.
+    """Tell whether M is positive away from the candidate x, and how far from x an equal rotation can be.
 
     If M >= delta across x, a rotation at angle phi from the polished candidate costs at least
     delta n sin^2(phi / 2) more, but for what rounding leaves of M x.

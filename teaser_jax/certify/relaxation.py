@@ -31,7 +31,7 @@ class RelaxedRotation(NamedTuple):
 def relaxed_rotation(
     measurements: HostMeasurements, rotation: Float[np.ndarray, "3 3"], tolerance: float
 ) -> RelaxedRotation:
-    """Solve (23), round it, and turn the dual solution into a certificate.
+    """Solve the relaxation (23), round it, and turn the dual solution into a certificate.
 
     Args:
         measurements: Vector pairs; padding is cut off.

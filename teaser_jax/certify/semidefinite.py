@@ -30,7 +30,7 @@ def smallest_eigenvalue(w: Float[Array, "n4 n4"], exists: Float[Array, " n"]) ->
 def factorisation_error(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Float[Array, ""]:
     """Bound how far below zero eigenvalues may lie although a Cholesky factorisation came to its end.
 
-    It is the backward error of the factorisation, (N + 2) eps trace, and that of making the matrix.
+    The bound is the backward error of the factorisation, (N + 2) eps trace, and that of making the matrix.
     """
     eps = jnp.finfo(matrix.dtype).eps
     terms = jnp.sum(m.src**2) + jnp.sum(m.dst**2) + jnp.sum(m.mask, dtype=m.cbar2.dtype) * m.cbar2

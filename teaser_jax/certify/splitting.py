@@ -91,7 +91,7 @@ class Trajectory(NamedTuple):
 def reference(m: Measurements, *, tolerance: Float[Array, ""] | float, iterations: int = 200) -> Trajectory:
     """Run Algorithm 3 as published: plain guess and coordinates, the smallest eigenvalue in every round.
 
-    It is slow, and here for comparison and conformance.
+    The algorithm is slow, and here for comparison and conformance.
     """
     first, exists, mu = dual_matrix(m, reference_guess(m)), existing(m), m.cost
     count = jnp.sum(exists)

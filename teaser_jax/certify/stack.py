@@ -36,7 +36,7 @@ def certify_stack(
     *,
     rounds: int,
 ) -> Certificate:
-    """Certify each item, and return the certificates as one with a leading axis.
+    """Certify each item of a stack, and return the certificates as one with a leading axis.
 
     Items that are too large go one by one, and so do all where the method is the published one.
     """
@@ -87,5 +87,5 @@ def _chunk(
 def _closed_forms(
     several: HostMeasurements, rotations: Float[Array, "c 3 3"], tolerance: Float[Array, ""]
 ) -> ClosedForm:
-    """Try the closed form on all at once."""
+    """Try the closed form on all items of a chunk at once."""
     return jax.vmap(lambda item, rotation: closed_form(item, rotation, tolerance))(several, rotations)

@@ -37,7 +37,7 @@ class Subject(NamedTuple):
 
 
 def subject_on_host(problem: Problem, solution: Solution, about: About) -> Subject:
-    """Choose the vectors on the host, of any number; problem and solution hold numpy arrays."""
+    """Choose the vectors to certify against, any number, on the host: problem and solution are in numpy."""
     if about == "pose":  # plain numpy: it is what is called most
         return _about_pose(problem, solution)
     with jax.enable_x64(True):
@@ -49,7 +49,7 @@ def subject_on_host(problem: Problem, solution: Solution, about: About) -> Subje
 def traced_subject(
     problem: Problem, solution: Solution, about: About, most: int
 ) -> tuple[Subject, Bool[Array, ""]]:
-    """Choose the vectors under jit, where sizes are static.
+    """Choose the vectors to certify against, under jit, where sizes are static.
 
     Args:
         problem: The problem, cleaned.

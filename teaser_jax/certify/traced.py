@@ -59,7 +59,7 @@ def traced_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Array, " k"]:
 
 
 def _narrowed(found: Certificate, dtype: Any) -> Certificate:
-    """Return to the dtype of the input, for JAX may have no float64 outside; claims are rounded down."""
+    """Convert a certificate to the input's dtype, as JAX may have no float64 outside; round claims down."""
 
     def narrow(x: Array) -> Array:
         return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x

@@ -38,7 +38,7 @@ class WholeSet:
     inliers: InlierSet
 
     def at(self, points: Float[np.ndarray, "p 3"] | Float[np.ndarray, " 3"]) -> Float[np.ndarray, " p"]:
-        """Bound how far each source point can be from where the other pose takes it [length of the dst]."""
+        """Bound how far each source point can be from where another pose takes it [length of the target]."""
         return _displacement(self.inliers, np.atleast_2d(np.asarray(points, np.float64)), self.wrong)
 
     @property

@@ -12,7 +12,7 @@ from teaser_jax.cli.report import errors_as_text
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Register a thousand matches, most of them wrong, tell about it, draw it, and return the exit code.
+    """Register a thousand matches, most of them wrong, print and draw the answer, and return the exit code.
 
     Without matplotlib the picture is left out.
 

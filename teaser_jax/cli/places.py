@@ -72,7 +72,7 @@ def writing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def failures_named(path: Path) -> Iterator[None]:
-    """Say in one line what keeps a file from being written."""
+    """Turn an OSError of the block into a BadInput that says in one line why a file cannot be written."""
     try:
         yield
     except OSError as error:

@@ -21,7 +21,7 @@ CHOICES = ("clique", "rotation")  # of Settings
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Register the matches of a file, write what is asked for, tell about it, and return the exit code.
+    """Register the matches of a file, write what is asked for, print the answer, and return the exit code.
 
     Raises:
         BadInput: If something cannot be read, solved or written; then no file has changed.

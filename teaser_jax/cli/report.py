@@ -14,7 +14,7 @@ from teaser_jax.register import Registration
 
 
 def errors_as_text(pose: Pose, truth: Pose, name: str) -> str:
-    """Tell how far a pose is from the truth, which the text calls by a name."""
+    """Tell in words how far a pose is from the truth, which the text calls by ``name``."""
     error = metrics.errors(pose, truth)
     return (
         f"\nError against the {name}\n"

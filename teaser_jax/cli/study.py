@@ -55,7 +55,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _join(cluster: str) -> None:
-    """Become one of several processes (``jax.distributed``), before any device is looked at."""
+    """Join the processes of a cluster (``jax.distributed``), before any device is looked at."""
     known = _place_in(cluster) if cluster else ()
     try:
         jax.distributed.initialize(*known)
@@ -78,7 +78,7 @@ def _place_in(cluster: str) -> tuple[str, int, int]:
 
 
 def _list() -> int:
-    """Tell the studies, who takes part in them, and who is missing."""
+    """Print the studies, who takes part in them, and who is missing."""
     for study in studies().values():
         print(f"{study.name:<14} {study.figure:<11} {study.title}; {study.runs} runs a cell")
         print("".join(f"{'':<16}{method.name}\n" for method in study.methods), end="")
@@ -88,7 +88,7 @@ def _list() -> int:
 
 
 def _export(name: str, model: Model, arguments: argparse.Namespace) -> None:
-    """Write the problems of a study and tell the files."""
+    """Write the problems of a study, and print the names of the files."""
     study = named_study(name)
     drawn = draw_trials(study, runs=arguments.runs, seed=arguments.seed, model=model, quick=arguments.quick)
     for path in save_trials(arguments.export, drawn, name=name):
@@ -96,7 +96,7 @@ def _export(name: str, model: Model, arguments: argparse.Namespace) -> None:
 
 
 def _go_on(name: str, model: Model, arguments: argparse.Namespace) -> None:
-    """Run a study, or go on with it, and tell its files."""
+    """Run a study, or go on with it, and print the names of its files."""
     try:
         place = run_study(
             name, arguments.folder,

@@ -74,7 +74,7 @@ def solve_groups(
 
 
 def as_stack(chunks: Iterator[Chunk], mine: Indices) -> Solution:
-    """The solutions of a stack, written into place as the chunks come in."""
+    """Assemble the solutions of a stack, written into place as the chunks come in."""
     whole: Any = None
     for places, solution in chunks:
         if whole is None:
@@ -86,7 +86,7 @@ def as_stack(chunks: Iterator[Chunk], mine: Indices) -> Solution:
 
 
 def as_list(chunks: Iterator[Chunk], problems: list[Problem]) -> list[Solution]:
-    """The solutions of a list, each in the rows of its own problem."""
+    """Assemble the solutions of a list, each in the rows of its own problem."""
     answers: list[Any] = [None] * len(problems)
     for places, solution in chunks:
         chunk = [problems[place] for place in places]
@@ -126,11 +126,11 @@ class Solver:
         return on_mesh(jax.tree.structure(self.settings), self.mesh)
 
     def run_length(self, size: Size) -> int:
-        """How many problems go through the programs side by side."""
+        """Count the problems that go through the programs side by side."""
         return run_length(size, device_kind(self.mesh)) * self.mesh.size
 
     def chunk_length(self, problems: Problem | list[Problem], chunk_size: int | None, count: int) -> int:
-        """How many of ``count`` problems make a chunk: whole runs, by default something for all threads."""
+        """Choose how many of ``count`` problems make a chunk: whole runs, by default some for all threads."""
         run = self.run_length(size_of(problems if isinstance(problems, Problem) else problems[0]))
         most = RUNS_A_CHUNK if self.on_cpu else 1
         runs = min(most, -(-count // (WORKERS * run))) if chunk_size is None else -(-chunk_size // run)
@@ -176,7 +176,7 @@ class Solver:
         return run._replace(clique=self._put(everywhere)), clique
 
     def _conclude(self, sent: PackedProblem, runs: list[Run], clique: Clique, size: Size) -> Any:
-        """Send all problems through the second program; what it returns, in numpy."""
+        """Send all problems through the second program, and return what it found, in numpy."""
         length = self.run_length(size)
         graph, answers = None, []
         chosen = in_runs(rows_for(size, self.settings, np.sum(clique.members, axis=1)), length)
@@ -203,7 +203,7 @@ class Solver:
         return there if self.on_cpu else jax.block_until_ready(there)
 
     def _run(self, program: Callable[..., Any], *args: Any) -> Any:
-        """Run a program; on accelerators alone and to its end, which costs nothing: others pack meanwhile."""
+        """Run a program; on accelerators alone and to its end, which costs nothing: other threads pack."""
         if self.on_cpu:
             return program(*args)
         with self.turn:
@@ -211,13 +211,13 @@ class Solver:
 
 
 def in_runs(choice: np.ndarray, length: int) -> list[tuple[Indices, Any]]:
-    """The problems of each run, and what was chosen for them: those that chose alike share runs."""
+    """Group problems into runs, each with what was chosen for it: those that chose alike share runs."""
     alike = [(np.flatnonzero(choice == each), each.item()) for each in np.unique(choice)]
     return [(rows[k : k + length], each) for rows, each in alike for k in range(0, len(rows), length)]
 
 
 def in_order(rows: Sequence[Indices], parts: Sequence[Any]) -> Any:
-    """What the runs have found, as one stack in the order of the chunk."""
+    """Join what the runs have found into one stack, in the order of the chunk."""
     order = np.concatenate(rows)
     whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)  # may be written to, as numpy's may
     if np.all(order[:-1] < order[1:]):
@@ -227,12 +227,12 @@ def in_order(rows: Sequence[Indices], parts: Sequence[Any]) -> Any:
 
 
 def first_of(arrays: Any, count: int) -> Any:
-    """The first rows of arrays, in numpy."""
+    """Take the first ``count`` rows of arrays, in numpy."""
     return jax.tree.map(lambda x: np.asarray(x)[:count], arrays)
 
 
 def chosen_problems(sent: PackedProblem, rows: Indices, length: int) -> PackedProblem:
-    """These problems; what fills the run repeats the first, with its rows masked."""
+    """Take the problems of the given rows; what fills the run repeats the first, with its rows masked."""
     filled = filled_up(sent, rows, length)
     if len(rows) < length:
         hide_rows(filled, len(rows))
@@ -240,7 +240,7 @@ def chosen_problems(sent: PackedProblem, rows: Indices, length: int) -> PackedPr
 
 
 def filled_up(arrays: Any, rows: Indices, length: int) -> Any:
-    """These rows of arrays; what fills the run repeats the first."""
+    """Take the given rows of arrays; what fills the run repeats the first."""
     if len(rows) == length == rows[-1] - rows[0] + 1:  # all in one piece: nothing is copied
         return jax.tree.map(lambda x: x[rows[0] : rows[0] + length], arrays)
     fill = np.append(rows, np.repeat(rows[:1], length - len(rows)))

@@ -23,9 +23,9 @@ ALL_ROWS = 0
 
 
 def rows_for(size: Size, settings: Settings, members: Int[np.ndarray, " b"]) -> Int[np.ndarray, " b"]:
-    """The smallest number of rows that holds each clique.
+    """Find the smallest number of rows that holds each clique.
 
-    It is a matter of the problem alone, as the last bits of its answer depend on it.
+    The number is a matter of the problem alone, as the last bits of the answer depend on it.
 
     Args:
         size: What the programs are compiled for.
@@ -40,7 +40,7 @@ def rows_for(size: Size, settings: Settings, members: Int[np.ndarray, " b"]) -> 
 
 
 def cascade_in(rows: int) -> Any:
-    """The cascade in so many rows instead of all; they must hold the clique, and TIMs be a chain."""
+    """Make the cascade in so many rows instead of all; they must hold the clique, and TIMs be a chain."""
     if rows == ALL_ROWS:
         return find_cascade
 

@@ -20,7 +20,7 @@ OUT_OF_MEMORY = ("RESOURCE_EXHAUSTED", "out of memory")
 
 
 def is_out_of_memory(error: Exception) -> bool:
-    """Whether an error of JAX's runtime says that memory was not enough.
+    """Tell whether an error of JAX's runtime says that memory was not enough.
 
     Its type is the same for every failure and it carries no code, so its text is all there is to ask.
     """

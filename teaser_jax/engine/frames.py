@@ -28,7 +28,7 @@ class Centred(NamedTuple):
 
 
 def centred(problem: Problem) -> Centred:
-    """The problem about the middle of its usable points; numpy, one problem."""
+    """Centre a problem about the middle of its usable points; numpy, one problem."""
     usable = finite_rows(problem.src, problem.dst, problem.mask)
     src, dst = problem.src[usable], problem.dst[usable]
     if not len(src):
@@ -44,7 +44,7 @@ def centred(problem: Problem) -> Centred:
 
 
 def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """The median of each coordinate, the upper one of two, in a third of the time of ``numpy.median``.
+    """Find the median of each coordinate, the upper one of two, in a third of the time of ``numpy.median``.
 
     A median, because one absurd coordinate must not move the origin far from the rest.
     """
@@ -53,7 +53,7 @@ def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
 
 
 def float32_will_do(src_extent: Any, dst_extent: Any, scale: Any, least_bound: Any, cbar2: Any) -> Any:
-    """Whether float32 widens no edge test by more than a thousandth of the bound: it is twice as fast.
+    """Tell whether float32 widens no edge test by more than a thousandth of the bound: it is twice as fast.
 
     No edge is lost in either precision; a few more may be added.
 
@@ -77,7 +77,7 @@ class CentredStack(NamedTuple):
 
 
 def centred_stack(sent: PackedProblem) -> CentredStack:
-    """The stack with points moved to their middle where float32 could not tell consistent matches otherwise.
+    """Move points of a stack to their middle where float32 could not tell consistent matches otherwise.
 
     Most stacks of a study need nothing, and finding the middle takes a quarter of the time of solving
     a small problem.
@@ -97,7 +97,7 @@ def centred_stack(sent: PackedProblem) -> CentredStack:
 
 
 def _narrow(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
-    """Which problems of a stack may have their edges tested in float32 where they lie."""
+    """Tell which problems of a stack may have their edges tested in float32 where they lie."""
     if not sent.scale_is_known:  # a voted scale keeps all digits
         return np.zeros(len(sent.numbers), bool)
     with np.errstate(invalid="ignore", over="ignore"):  # numbers that make no sense: a status will say so
@@ -113,7 +113,7 @@ def _narrow(sent: PackedProblem) -> Bool[np.ndarray, " b"]:
 
 
 def _narrow_among(sent: PackedProblem, usable: Bool[np.ndarray, "b n"]) -> Bool[np.ndarray, " b"]:
-    """The same question, where the extents are those of all rows and the bounds those of the usable ones."""
+    """Tell which problems float32 can test, by the extents of all rows and the bounds of the usable ones."""
     b, rows, n = sent.columns.shape
     clouds = sent.columns.reshape(b, rows * n)[:, : 6 * n].reshape(
         b, 2, 3 * n
@@ -126,7 +126,7 @@ def _narrow_among(sent: PackedProblem, usable: Bool[np.ndarray, "b n"]) -> Bool[
 def with_origins(
     solution: Solution, src_origin: Float[np.ndarray, "*b 3"], dst_origin: Float[np.ndarray, "*b 3"]
 ) -> Solution:
-    """The solution of centred clouds (or of a stack of them) in the frames that these came from."""
+    """Carry the solution of centred clouds (or a stack of them) back to the frames that these came from."""
     pose = solution.pose
     turned = so3.rotate(pose.rotation, src_origin[..., None, :])[..., 0, :]
     with np.errstate(over="ignore", invalid="ignore"):  # of points at the end of all numbers
@@ -136,7 +136,7 @@ def with_origins(
 
 
 def without_padding(solution: Solution, problem: Problem) -> Solution:
-    """The solution in the rows of its problem, or of a stack of them; padding came last."""
+    """Cut the padding, which came last, off a solution, or a stack of them: the rows of its problem stay."""
     n = problem.src.shape[-2]
     m = n if problem.pairs is None else problem.pairs.shape[-2]
     chosen = solution.selection

@@ -16,7 +16,7 @@ from teaser_jax.settings import Settings
 
 
 def by_size(problems: Sequence[Problem]) -> dict[Size, Int[np.ndarray, "_"]]:
-    """The places of the problems of each size, in the user's order."""
+    """List the places of the problems of each size, in the user's order."""
     places: dict[Size, list[int]] = {}
     for k, problem in enumerate(problems):
         places.setdefault(size_of(problem), []).append(k)
@@ -24,7 +24,7 @@ def by_size(problems: Sequence[Problem]) -> dict[Size, Int[np.ndarray, "_"]]:
 
 
 def pack_list(problems: Sequence[Problem], settings: Settings, size: Size) -> PackedProblem:
-    """Problems of one size as one batch on the host; those of as many rows are packed together."""
+    """Pack problems of one size as one batch on the host; those of as many rows are packed together."""
     whole: Any = None
     for rows in by_shape(problems).values():
         alike = [problems[k] for k in rows]
@@ -39,7 +39,7 @@ def pack_list(problems: Sequence[Problem], settings: Settings, size: Size) -> Pa
 
 
 def by_shape(problems: Sequence[Problem]) -> dict[tuple[int, int | None], list[int]]:
-    """The places of the problems of each number of rows and of pairs."""
+    """List the places of the problems of each number of rows and of pairs."""
     places: dict[tuple[int, int | None], list[int]] = {}
     for k, problem in enumerate(problems):
         m = None if problem.pairs is None else problem.pairs.shape[0]

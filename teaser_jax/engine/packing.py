@@ -53,7 +53,7 @@ class PackedProblem:
 
     @property
     def mask(self) -> Bool[AnyArray, "*batch n"]:
-        """Rows to use."""
+        """The rows to use."""
         return self.columns[..., MASK, :] > 0
 
     @property
@@ -73,7 +73,7 @@ class PackedProblem:
 
 
 def pack_problem(problem: Problem, settings: Settings, size: Size) -> PackedProblem:
-    """A problem on the host, or a stack of them, padded to a size; padding is masked."""
+    """Pack a problem on the host, or a stack of them, padded to a size; padding is masked."""
     *front, count, _ = problem.src.shape
     columns = np.zeros((*front, ROWS, size.matches))
     columns[..., 0:3, :count] = np.swapaxes(problem.src, -1, -2)
@@ -98,7 +98,7 @@ def hide_rows(packed: PackedProblem, first: int) -> None:
 
 
 def unpack_problem(packed: PackedProblem) -> Problem:
-    """One problem again, in padded rows; the arrays are of the kind that was packed."""
+    """Unpack one problem, in padded rows; the arrays are of the kind that was packed."""
     src, dst = packed.clouds
     return Problem(
         src=src.T,
@@ -113,7 +113,7 @@ def unpack_problem(packed: PackedProblem) -> Problem:
 
 
 def unpack_settings(packed: PackedProblem, choices: Any) -> Settings:
-    """The settings again, on the device.
+    """Unpack the settings, on the device.
 
     Args:
         packed: What was sent.
@@ -158,7 +158,7 @@ class Packed:
 
 
 def pack(record: Any) -> Packed:
-    """A record of one problem in few arrays, on the device. A leaf that stands in it twice travels once."""
+    """Pack a record of one problem in few arrays, on the device. A leaf that is in it twice travels once."""
     leaves, structure = jax.tree.flatten(record)
     numbers: list[Any] = []
     others: list[Any] = []
@@ -186,12 +186,12 @@ def pack(record: Any) -> Packed:
 
 
 def fetch(packed: Packed) -> Packed:
-    """The arrays on the host: a tenth of the time of ``jax.device_get`` where that is the device."""
+    """Fetch the arrays to the host, in a tenth of the time of ``jax.device_get`` where that is the device."""
     return jax.tree.map(np.asarray, packed)
 
 
 def unpack(host: Packed) -> Any:
-    """The record again, or a stack of them, in numpy."""
+    """Unpack a record, or a stack of them, in numpy."""
     front = host.numbers.shape[:-1]
     # Most masks are one column: these are laid out so that each is in one piece.
     columns = [np.ascontiguousarray(np.moveaxis(each, -1, 0)) for each in host.masks]

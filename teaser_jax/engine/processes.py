@@ -14,7 +14,7 @@ from teaser_jax.engine.programs import AXIS
 
 
 def local_mesh(mesh: Mesh | None) -> Mesh | None:
-    """The devices of this process as a mesh of one axis; None if it has none.
+    """Make a mesh of one axis of the devices of this process; None if it has none.
 
     Args:
         mesh: The devices of all processes to choose from; None: all there are.
@@ -25,7 +25,7 @@ def local_mesh(mesh: Mesh | None) -> Mesh | None:
 
 
 def share(count: int, mesh: Mesh | None) -> slice:
-    """Which of so many problems this process solves: a piece in proportion to its devices."""
+    """Tell which of so many problems this process solves: a piece in proportion to its devices."""
     devices = list(jax.devices() if mesh is None else mesh.devices.flat)
     before = sum(d.process_index < jax.process_index() for d in devices)
     mine = sum(d.process_index == jax.process_index() for d in devices)
@@ -57,7 +57,7 @@ def check_agreement(function: str, given: Any, *, error: type[ValueError] = Valu
 
 
 def all_of(mine: Any) -> list[Any]:
-    """What every process has, in their order. All of them must call it."""
+    """Gather what every process has, in their order. All processes must call this function."""
     if jax.process_count() == 1:
         return [mine]
     from jax.experimental.multihost_utils import process_allgather

@@ -35,7 +35,7 @@ MEMORY = 1 << 30  # bytes a device may hold for the problems of one run
 def before_search(
     sent: PackedProblem, choices: Any, edge_dtype: Any
 ) -> tuple[Graph, Clique, Bool[Array, ""]]:
-    """The first program: scale, graph, and the clique as far as the device takes it.
+    """Run the first program: scale, graph, and the clique as far as the device takes it.
 
     Args:
         sent: The problem and the numbers of its settings.
@@ -55,7 +55,7 @@ def before_search(
 def after_search(
     sent: PackedProblem, graph: Graph, clique: Clique, choices: Any, rows: int = ALL_ROWS
 ) -> Packed:
-    """The second program: the sets, the pose, the verdict.
+    """Run the second program: the sets, the pose, the verdict.
 
     Args:
         sent, choices: As for the first program.
@@ -68,7 +68,7 @@ def after_search(
 
 
 class Programs(NamedTuple):
-    """Both programs, compiled as they are called: once for each size, type of edges and number of rows."""
+    """Both device programs, compiled when called: once for each size, type of edges and number of rows."""
 
     before: Callable[..., Any]
     after: Callable[..., Any]
@@ -85,12 +85,12 @@ ON_ONE_DEVICE = Programs(
 
 
 def device_kind(mesh: Mesh) -> str:
-    """The kind of devices that a mesh has: "cpu", "gpu", ..."""
+    """Name the kind of devices that a mesh has: "cpu", "gpu", ..."""
     return mesh.devices.flat[0].platform
 
 
 def run_length(size: Size, kind: str) -> int:
-    """How many problems of a size one device solves in one run: the same whatever the chunks."""
+    """Count the problems of a size that one device solves in one run: the same whatever the chunks."""
     n = size.matches
     if kind == "cpu":
         beside = min(MOST, MOST_ROWS // n)
@@ -100,13 +100,13 @@ def run_length(size: Size, kind: str) -> int:
 
 
 def sharding_over(mesh: Mesh) -> NamedSharding:
-    """How the problems of a batch lie on a mesh of one axis: a share on each device."""
+    """Lay the problems of a batch over a mesh of one axis: a share on each device."""
     return NamedSharding(mesh, PartitionSpec(AXIS))
 
 
 @lru_cache(maxsize=64)
 def on_mesh(choices: Any, mesh: Mesh) -> Programs:
-    """Both programs over the problems of a batch, on a mesh of one axis; no device waits for another.
+    """Make both programs over the problems of a batch, on a mesh of one axis; no device waits for another.
 
     Args:
         choices: The structure of the settings.

@@ -16,7 +16,7 @@ from teaser_jax.stages.clique.maximum import finish_on_host
 
 
 def solve_one(problem: Problem, settings: Settings) -> Solution:
-    """The solution of a problem in float64 numpy, in its own frames and rows.
+    """Solve a problem in its own frames and rows, with a solution in float64 numpy.
 
     Whether JAX's 64-bit types are switched on does not matter.
     """

@@ -18,7 +18,7 @@ class Size(NamedTuple):
 
 
 def padded_size(n: int) -> int:
-    """The size that serves n rows: powers of two up to 1024, then steps of 512 up to 2048, then of 1024.
+    """Round n rows up to a size: powers of two up to 1024, then steps of 512 up to 2048, then of 1024.
 
     Eight programs serve all sizes from 300 to 6000, and padding costs a fifth of the time there.
     """
@@ -29,6 +29,6 @@ def padded_size(n: int) -> int:
 
 
 def size_of(problem: Problem) -> Size:
-    """The size that serves one problem, or a stack of them."""
+    """Find the size that serves one problem, or a stack of them."""
     pairs = None if problem.pairs is None else padded_size(problem.pairs.shape[-2])
     return Size(padded_size(problem.src.shape[-2]), pairs, problem.scale is not None)

@@ -59,7 +59,7 @@ def read_matches(path: str | PathLike[str]) -> MatchFile:
 
 
 def _reader(path: Path) -> Callable[[Path], MatchFile]:
-    """Choose by the extension who reads a file, or raise FileError."""
+    """Choose the reader of a file by its extension, or raise FileError."""
     if path.is_dir():
         raise FileError(f"{path}: is a folder: name the file of matches in it.")
     readers = {".npz": _read_npz, **dict.fromkeys(TEXT, _read_text)}
@@ -121,7 +121,7 @@ def _fields(line: str, delimiter: str | None) -> list[str]:
 
 
 def _is_header(fields: list[str]) -> bool:
-    """Whether a first row holds column names; one that is partly numbers is an error instead."""
+    """Tell whether a first row holds column names; one that is partly numbers is an error instead."""
     return fields == PANDAS_HEADER or not any(_is_number(field) for field in fields)
 
 

@@ -38,7 +38,7 @@ CONCRETE = (np.ndarray, float, int, type(None))
 
 
 def namespace(*arrays: object) -> ModuleType:
-    """``jax.numpy`` if any array is JAX's (tracers included), ``numpy`` otherwise.
+    """Return ``jax.numpy`` if any array is JAX's (tracers included), ``numpy`` otherwise.
 
     Host results stay float64 although JAX may run with 64-bit types switched off.
     """
@@ -46,18 +46,18 @@ def namespace(*arrays: object) -> ModuleType:
 
 
 def is_traced(*values: Any) -> bool:
-    """Whether any leaf of the values is a tracer, so that its number is not known."""
+    """Tell whether any leaf of the values is a tracer, so that its number is not known."""
     unclear = [x for x in values if not isinstance(x, CONCRETE)]
     return bool(unclear) and any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
 
 
 def inside_jit() -> bool:
-    """Whether this code runs while JAX traces a program, so that even constants become tracers."""
+    """Tell whether this code runs while JAX traces a program, so that even constants become tracers."""
     return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
 def rounded_product(a: Array, b: Array) -> Array:
-    """The product a b, rounded before anything is added to it.
+    """Compute the product a b, rounded before anything is added to it.
 
     Compilers fuse a product and a sum where their vectors happen to allow it, so that the last bit
     would depend on the place in a batch. A comparison between the two prevents that; a reduction of
@@ -70,12 +70,12 @@ def rounded_product(a: Array, b: Array) -> Array:
 
 
 def safe_norm(vectors: Float[Array, "*k d"]) -> Float[Array, "*k"]:
-    """The lengths along the last axis, with derivative zero (not NaN) at zero."""
+    """Compute the lengths along the last axis, with derivative zero (not NaN) at zero."""
     return safe_sqrt(jnp.sum(vectors * vectors, axis=-1))
 
 
 def safe_sqrt(squares: Float[Array, "*k"]) -> Float[Array, "*k"]:
-    """The square root, with derivative zero (not infinite) at zero."""
+    """Compute the square root, with derivative zero (not infinite) at zero."""
     positive = squares > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1)), 0)
 
@@ -91,8 +91,8 @@ def inner_products(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Arra
 def squared_distances(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
     """Square the distance of every row of ``a`` from every row of ``b``.
 
-    As |a|^2 + |b|^2 - 2 a.b, one product of matrices: rows should lie about the origin, or the squares of far
-    coordinates cancel.
+    Computed as |a|^2 + |b|^2 - 2 a.b, one product of matrices: rows should lie about the origin, or the
+    squares of far coordinates cancel.
 
     Gradients: exact.
     """
@@ -120,7 +120,7 @@ def float32_or_wider(dtype: Any) -> np.dtype:
 
 
 def as_numpy(value: Any, name: str) -> np.ndarray:
-    """A numpy view or copy of anything with ``__array__`` or ``__dlpack__``, or of nested lists.
+    """Read anything with ``__array__`` or ``__dlpack__``, or nested lists, as a numpy view or copy.
 
     Args:
         value: What the user gave.
@@ -145,7 +145,7 @@ def as_numpy(value: Any, name: str) -> np.ndarray:
 
 
 def _without_hidden(array: np.ma.MaskedArray) -> np.ndarray:
-    """What is hidden must not come back as a number: it becomes NaN, or False among truth values."""
+    """Replace hidden entries, which must not come back as numbers: by NaN, or False among truth values."""
     if not np.ma.is_masked(array):
         return array.data
     if array.dtype.kind == "b":

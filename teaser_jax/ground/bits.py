@@ -15,12 +15,12 @@ LANES = 32
 
 
 def words(n: int) -> int:
-    """How many 32-bit words hold n bits."""
+    """Count the 32-bit words that hold n bits."""
     return -(-n // LANES)
 
 
 def pack(mask: Bool[Array, "*k n"]) -> UInt32[Array, "*k w"]:
-    """A mask as words along the last axis; bits beyond n are zero."""
+    """Pack a mask into words along the last axis; bits beyond n are zero."""
     *batch, n = mask.shape
     padded = jnp.pad(mask, [(0, 0)] * len(batch) + [(0, words(n) * LANES - n)])
     lanes = padded.reshape(*batch, words(n), LANES).astype(jnp.uint32)
@@ -28,41 +28,41 @@ def pack(mask: Bool[Array, "*k n"]) -> UInt32[Array, "*k w"]:
 
 
 def unpack(packed: UInt32[Array, "*k w"], n: int) -> Bool[Array, "*k n"]:
-    """Words as a mask of n bits along the last axis."""
+    """Unpack words into a mask of n bits along the last axis."""
     bits = (packed[..., None] >> _each_lane(packed.ndim + 1)) & 1
     return bits.reshape(*packed.shape[:-1], -1)[..., :n].astype(bool)
 
 
 def _each_lane(ndim: int) -> UInt32[Array, "*ones 32"]:
-    """The numbers of the lanes, along the last of so many axes."""
+    """Number the lanes, along the last of so many axes."""
     return lax.broadcast_to_rank(jnp.arange(LANES, dtype=jnp.uint32), ndim)
 
 
 def no_bits(n: int) -> UInt32[Array, "n w"]:
-    """Rows of n bits with none set."""
+    """Make n rows of n bits with none set."""
     return jnp.zeros((n, words(n)), jnp.uint32)
 
 
 def with_lane(
     packed: UInt32[Array, "n w"], lane: Int[Array, ""], verdicts: Bool[Array, "n w"]
 ) -> UInt32[Array, "n w"]:
-    """The rows with one lane set where the verdicts are true; the lane must have been clear."""
+    """Set one lane of the rows where the verdicts are true; the lane must have been clear."""
     return packed | (verdicts.astype(jnp.uint32) << lane.astype(jnp.uint32))
 
 
 def lane_of(packed: UInt32[Array, "n w"], lane: Int[Array, ""]) -> Bool[Array, "n w"]:
-    """The verdicts of one lane."""
+    """Read the verdicts of one lane."""
     return ((packed >> lane.astype(jnp.uint32)) & 1).astype(bool)
 
 
 def in_lanes(values: Shaped[Array, " n"]) -> Shaped[Array, "32 w"]:
-    """Values of the columns, a row for each lane; what fills the last word is zero."""
+    """Arrange the values of the columns as a row for each lane; what fills the last word is zero."""
     (n,) = values.shape
     return jnp.pad(values, (0, words(n) * LANES - n)).reshape(words(n), LANES).T
 
 
 def others(n: int) -> UInt32[Array, "n w"]:
-    """Rows with every bit set but a row's own, and none beyond n."""
+    """Make n rows with every bit set but the row's own, and none beyond n."""
     index, word = jnp.arange(n, dtype=jnp.int32)[:, None], jnp.arange(words(n), dtype=jnp.int32)[None]
     own = jnp.uint32(1) << (index % LANES).astype(jnp.uint32)
     within = jnp.minimum(n - LANES * word, LANES)  # bits of this word that exist: 1 to 32
@@ -71,12 +71,12 @@ def others(n: int) -> UInt32[Array, "n w"]:
 
 
 def count(packed: UInt32[Array, "*k w"]) -> Int[Array, "*k"]:
-    """How many bits are set along the last axis."""
+    """Count the bits that are set along the last axis."""
     return jnp.sum(lax.population_count(packed), axis=-1, dtype=jnp.int32)
 
 
 def rank(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """How many are set up to and including each: a running sum in two small products.
+    """Count the bits set up to and including each: a running sum in two small products.
 
     XLA would make log n passes of a cumulative sum on the CPU. Exact: counts stay below 2^24.
     """
@@ -89,14 +89,14 @@ def rank(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
 
 
 def listed(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
-    """The set positions in order, then zeros."""
+    """List the set positions in order, then zeros."""
     n = mask.shape[0]
     place = jnp.where(mask, rank(mask) - 1, n)
     return jnp.zeros(n, jnp.int32).at[place].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
 
 
 def first_smallest(x: Shaped[Array, " m"]) -> Int[Array, ""]:
-    """The index of the first smallest entry: ``argmin`` from plain reductions.
+    """Find the index of the first smallest entry: ``argmin`` from plain reductions.
 
     Inside a jit, programs are lowered after a caller's x64 block was left. What is lowered by way
     of other JAX functions (argmin, an iota of 64 bits) then mixes 32 and 64 bits; plain operations
@@ -107,6 +107,6 @@ def first_smallest(x: Shaped[Array, " m"]) -> Int[Array, ""]:
 
 
 def unpack_host(packed: UInt32[np.ndarray, "*k w"], n: int) -> Bool[np.ndarray, "*k n"]:
-    """Words as a mask of n bits, in numpy, whatever the machine's byte order."""
+    """Unpack words into a mask of n bits, in numpy, whatever the machine's byte order."""
     little = np.ascontiguousarray(packed).astype("<u4", copy=False)
     return np.unpackbits(little.view(np.uint8), axis=-1, bitorder="little", count=n).astype(bool)

@@ -17,7 +17,7 @@ class FileError(ValueError):
 
 
 def one_line(message: object, limit: int = 300) -> str:
-    """A message without line breaks and of bearable length."""
+    """Turn a message into one line of bearable length."""
     text = "".join(c if c.isprintable() else " " for c in str(message))
     text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."
@@ -25,7 +25,7 @@ def one_line(message: object, limit: int = 300) -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A place to write, which becomes ``path`` at the end; after a failure ``path`` is as before."""
+    """Give a place to write, which becomes ``path`` at the end; after a failure ``path`` is as before."""
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     try:
         yield partial
@@ -35,7 +35,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def read_archive(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an ``.npz`` by name.
+    """Read the arrays of an ``.npz`` by name.
 
     Raises:
         FileError: If the file is no archive, or is broken.
@@ -45,7 +45,7 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
 
 
 def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
-    """What ``read`` returns; whatever it raises, but OSError, becomes a FileError that says ``what``.
+    """Return what ``read`` returns; whatever it raises, but OSError, becomes a FileError that says ``what``.
 
     Broken files make zipfile, zlib, struct, ast and numpy raise nearly anything, in every
     version something else: so everything is caught here, and nowhere else.

@@ -33,7 +33,7 @@ class NumberRule:
     infinite: bool = False
 
     def admits(self, value: float) -> bool:
-        """Whether a number keeps the rule."""
+        """Tell whether a number keeps the rule."""
         return value >= self.least and value > self.above and (self.infinite or bool(np.isfinite(value)))
 
     @property
@@ -50,7 +50,7 @@ class CountRule:
 
 
 def number(default: float, *, least: float = -np.inf, above: float = -np.inf, infinite: bool = False) -> Any:
-    """A traced field of a record.
+    """Make a traced field of a record.
 
     Args:
         default: What the field is unless it is given.
@@ -61,7 +61,7 @@ def number(default: float, *, least: float = -np.inf, above: float = -np.inf, in
 
 
 def count(default: int, *, least: int = 1, traced: bool = False) -> Any:
-    """A field of a record that holds a whole number; static unless ``traced``.
+    """Make a field of a record that holds a whole number; static unless ``traced``.
 
     Args:
         default: What the field is unless it is given.
@@ -72,7 +72,7 @@ def count(default: int, *, least: int = 1, traced: bool = False) -> Any:
 
 
 def named(name: str) -> Any:
-    """A static field that tells a method from every other, which JAX does not.
+    """Make a static field that tells a method from every other, which JAX does not.
 
     JAX takes two records for one structure if their fields are alike, whatever their classes are: without a
     name, a program compiled for one method would be run for another.
@@ -108,7 +108,7 @@ def check_concrete(record: Any) -> None:
 
 
 def _checked(record: Any, which: Field[Any], value: Any) -> float | int:
-    """The number as a Python float or int; ValueError if it breaks its rule."""
+    """Turn a number into a Python float or int; ValueError if it breaks its rule."""
     name, rule = f"{type(record).__name__}.{which.name}", which.metadata[RULE]
     if isinstance(rule, CountRule):
         return whole_number(name, value, rule.least)

@@ -155,7 +155,7 @@ def matching_loss(
     src_mask: Bool[AnyArray, " n"] | None = None,
     dst_mask: Bool[AnyArray, " m"] | None = None,
 ) -> Float[Array, ""]:
-    """Ask that descriptors of the same place, given a pose, are alike: a contrastive loss [nat].
+    """Measure how unlike descriptors of the same place are, given a pose: a contrastive loss [nat].
 
     Target points within ``radius`` of where the pose takes a source point are the same place, those beyond
     twice the radius are others, and between the two nothing is asked. For each point that has a counterpart:

@@ -36,7 +36,7 @@ def plot_trims(
     hold each scale; the estimate stands in green, the truth dotted.
 
     Args:
-        values, bounds: TRIMs s_ij and alpha_ij [-], from ``stages.invariants.trims``.
+        values, bounds: TRIMs s_ij and alpha_ij [-], from ``stages.pairs.trims``.
         estimate: The scale of the vote [-].
         cbar2: Truncation [-].
         truth: The true scale [-], if known.

@@ -20,7 +20,7 @@ from teaser_jax.stages.pairs import PairSlice, fold_pairs, squared_norm, tim_bou
 def rounding_margin(
     src: Float[Array, "n 3"], dst: Float[Array, "n 3"], mask: Bool[Array, " n"], scale: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """How far | |b_ij| - s |a_ij| | may be off by rounding, input and arithmetic together [length].
+    """Bound how far | |b_ij| - s |a_ij| | may be off by rounding, input and arithmetic together [length].
 
     A coordinate x is known to eps |x| / 2; two points and the handful of operations on their
     difference make at most five times eps times the largest norm on either side. Eight covers the
@@ -31,7 +31,7 @@ def rounding_margin(
 
 
 def margin_of(dtype: Any, reach: Any) -> Any:
-    """The rounding margin of a dtype, for points of both clouds together that reach so far [length].
+    """Compute the rounding margin of a dtype, for points of both clouds that together reach so far [length].
 
     Args:
         dtype: The type in which edges are tested.
@@ -43,9 +43,9 @@ def margin_of(dtype: Any, reach: Any) -> Any:
 def lengths_agree(
     src_squared: Float[Array, "*k"], dst_squared: Float[Array, "*k"], tolerance: Float[Array, "*k"]
 ) -> Bool[Array, "*k"]:
-    """| |b| - |a| | <= d from squared lengths: (A - B)^2 <= d^2 (2 (A + B) - d^2), or A + B <= d^2.
+    """Test | |b| - |a| | <= d by squared lengths: (A - B)^2 <= d^2 (2 (A + B) - d^2), or A + B <= d^2.
 
-    The same verdict without square roots, which would be most of the work. Both cases are
+    That spares the square roots, which would be most of the work. Both cases are
     (A - B)^2 <= d^2 max(2 (A + B) - d^2, A + B): the second term is the larger one where
     A + B <= d^2, and then (A - B)^2 <= (A + B)^2 is below. Where one length is nearly zero and the
     other nearly d, both sides are d^4 and their difference has a double root: there the rounding
@@ -67,7 +67,7 @@ def consistency_graph(
     cbar2: Float[Array, ""],
     pairs: Int[Array, "m 2"] | None = None,
 ) -> UInt32[Array, "n w"]:
-    """Edges between matches with | |b_ij| - s |a_ij| | <= c (beta_i + beta_j), as packed bit rows.
+    """Find edges between matches with | |b_ij| - s |a_ij| | <= c (beta_i + beta_j), as packed bit rows.
 
     Bit t of word j in row i is the edge (i, 32 j + t); the rows are symmetric, without loops, and
     empty for masked matches. With ``pairs`` only those are tested and every other pair counts as

@@ -24,7 +24,7 @@ Carry = TypeVar("Carry")
 
 
 def tims(points: Float[Array, "n 3"], pairs: Int[Array, "m 2"]) -> Float[Array, "m 3"]:
-    """Translation invariant measurements: the difference x_j - x_i of each pair (i, j).
+    """Compute translation invariant measurements: the difference x_j - x_i of each pair (i, j).
 
     Equal to the incidence matrix of the graph times the points (Theorem 4).
 
@@ -36,14 +36,14 @@ def tims(points: Float[Array, "n 3"], pairs: Int[Array, "m 2"]) -> Float[Array, 
 
 
 def tim_bounds(noise_bound: Float[Array, " n"], pairs: Int[Array, "m 2"]) -> Float[Array, " m"]:
-    """The bounds delta_ij = beta_i + beta_j of the TIMs [length]. Gradients: exact."""
+    """Compute the bounds delta_ij = beta_i + beta_j of the TIMs [length]. Gradients: exact."""
     return noise_bound[pairs[:, 0]] + noise_bound[pairs[:, 1]]
 
 
 def trims(
     src_tims: Float[Array, "m 3"], dst_tims: Float[Array, "m 3"], bounds: Float[Array, " m"]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Scale measurements s_ij = |b_ij| / |a_ij| and their bounds alpha_ij = delta_ij / |a_ij|.
+    """Compute scale measurements s_ij = |b_ij| / |a_ij| and their bounds alpha_ij = delta_ij / |a_ij|.
 
     Lengths do not change under rotation, so a TRIM depends on the scale alone. A zero-length
     source pair says nothing: it gets the value 0 and an infinite bound, which cannot vote.
@@ -62,7 +62,7 @@ def trims(
 
 
 class PairSlice(NamedTuple):
-    """One in 32 of the complete graph: every row i against the columns j = 32 w + lane."""
+    """One in 32 of the pairs of the complete graph: every row i against the columns j = 32 w + lane."""
 
     src_tims: tuple[Float[Array, "n w"], ...]  # components of a_i - a_j
     dst_tims: tuple[Float[Array, "n w"], ...]
@@ -109,18 +109,18 @@ def fold_pairs(
 
 
 def squared_norm(components: tuple[Float[Array, "*k"], ...]) -> Float[Array, "*k"]:
-    """The squared lengths of vectors that are given by component."""
+    """Compute the squared lengths of vectors that are given by component."""
     x, y, z = components
     return x * x + y * y + z * z
 
 
 def usable_pairs(pairs: Int[Array, "m 2"], mask: Bool[Array, " n"]) -> Bool[Array, " m"]:
-    """Which pairs join two different usable matches."""
+    """Tell which pairs join two different usable matches."""
     return mask[pairs[:, 0]] & mask[pairs[:, 1]] & (pairs[:, 0] != pairs[:, 1])
 
 
 def ring_pairs(members: Bool[Array, " n"]) -> Int[Array, "n 2"]:
-    """Pairs (i, next member after i) in the user's order, the last member with the first.
+    """List the pairs (i, next member after i) in the user's order, the last member with the first.
 
     Rows of points that are no members hold (i, i).
     """

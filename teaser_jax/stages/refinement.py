@@ -53,7 +53,7 @@ def fit_similarity(
     weights: Float[Array, " n"],
     scale: Float[Array, ""] | None = None,
 ) -> Fit:
-    """The minimiser of sum w |b - s R a - t|^2; ``scale=None`` estimates s = tr(R^T H) / sum w |a|^2.
+    """Minimise sum w |b - s R a - t|^2; ``scale=None`` estimates s = tr(R^T H) / sum w |a|^2.
 
     Fewer than three weights above zero leave the rotation at the identity, and a source of no extent
     the scale at 1.
@@ -87,7 +87,7 @@ def fit_similarity(
 def squared_residuals(
     pose: Pose, src: Float[Array, "n 3"], dst: Float[Array, "n 3"], noise_bound: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """The squared residual |b - s R a - t|^2 / beta^2 of each match [-]. Gradients: exact."""
+    """Compute the squared residual |b - s R a - t|^2 / beta^2 of each match [-]. Gradients: exact."""
     # By components: three sums of three fuse into one pass, a product of matrices does not.
     turned = [sum(pose.rotation[i, j] * src[:, j] for j in range(3)) for i in range(3)]
     r2 = sum((dst[:, i] - pose.scale * turned[i] - pose.translation[i]) ** 2 for i in range(3))
@@ -97,7 +97,7 @@ def squared_residuals(
 def truncated_cost(
     r2: Float[Array, " n"], mask: Bool[Array, " n"], cbar2: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """The cost (6) over the matches of the mask [-]."""
+    """Compute the truncated cost (6) over the matches of the mask [-]."""
     return jnp.sum(jnp.where(mask, jnp.minimum(r2, cbar2), 0))
 
 
@@ -112,7 +112,7 @@ def refine(
     cbar2: Float[Array, ""],
     iterations: int,
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
-    """The inlier set at the end of the descent from ``pose``, and whether it settled.
+    """Find the inlier set at the end of the descent from ``pose``, and tell whether it settled.
 
     Each step can only lower the cost, so the descent ends.
 

@@ -77,7 +77,7 @@ def estimate_scale(
     criterion: Criterion = "tls",
     scale_range: tuple[Any, Any] = (0.0, float("inf")),
 ) -> tuple[Float[Array, ""], ScalePairs]:
-    """The TLS scale of all TRIMs (11), or of those of the given pairs, and its consensus set.
+    """Estimate the TLS scale of all TRIMs (11), or of those of the given pairs; find its consensus set.
 
     Runs in float64 whatever the dtype of the points, because running sums of a million terms
     cancel; JAX's configuration is left as it was.
@@ -126,7 +126,7 @@ def scale_of_pairs(
     *,
     pairs: Int[Array, "m 2"] | None = None,
 ) -> Float[Array, ""]:
-    """The weighted mean (14) of the chosen TRIMs, with weights confidence / alpha_ij^2.
+    """Compute the weighted mean (14) of the chosen TRIMs, with weights confidence / alpha_ij^2.
 
     Written as sum w |a||b| / sum w |a|^2 with w = confidence / delta^2, which divides by nothing
     small. An empty choice gives 0.
@@ -166,22 +166,22 @@ class CompleteTrims:
         self.index = jnp.arange(self.length, dtype=jnp.int32)
 
     def row(self, k: Int[Array, ""]) -> tuple[Array, Array, Array]:
-        """Values, bounds, and which of them can vote, of one row."""
+        """Compute the values and bounds of one row, and tell which of them can vote."""
         others = [lax.dynamic_slice_in_dim(x, k + 1, self.length) for x in self.wrapped]
         return self._trims(k, self.index, self.matches, others)
 
     def recall(self, k: Int[Array, " m"], i: Int[Array, " m"]) -> tuple[Array, Array, Array]:
-        """Those at given rows and places."""
+        """Compute the values and bounds at given rows and places, and tell which of them can vote."""
         j = (i + k + 1) % self.length
         return self._trims(k, i, [x[i] for x in self.matches], [x[j] for x in self.matches])
 
     def all(self) -> tuple[Array, Array, Array]:
-        """Every one, row by row."""
+        """Compute the values and bounds of all rows, one after the other, and tell which of them can vote."""
         rows = lax.map(self.row, jnp.arange(self.rows, dtype=jnp.int32))
         return tuple(x.reshape(-1) for x in rows)
 
     def typical(self) -> Float[Array, ""]:
-        """The geometric mean of a row: no few absurd points move it far."""
+        """Compute the geometric mean of the first row: no few absurd points move it far."""
         values, _, voters = self.row(jnp.int32(0))
         voters &= values > 0
         total = jnp.sum(jnp.log(jnp.where(voters, values, 1)))
@@ -200,9 +200,9 @@ class CompleteTrims:
 def _agreeing_pairs(
     src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
 ) -> tuple[Float[Array, ""], UInt32[Array, "n w"]]:
-    """The pairs that vote and have | |b_ij| - s |a_ij| | <= c delta_ij, as bit rows.
+    """Find the pairs that vote and have | |b_ij| - s |a_ij| | <= c delta_ij, as bit rows.
 
-    Also their weighted mean (14), as sum w |a||b| / sum w |a|^2 with w = 1 / delta^2.
+    Also compute their weighted mean (14), as sum w |a||b| / sum w |a|^2 with w = 1 / delta^2.
     """
     c = jnp.sqrt(cbar2)
 

@@ -18,7 +18,7 @@ def estimate_translation(
     cbar2: Float[Array, ""],
     criterion: Criterion = "tls",
 ) -> tuple[Float[Array, "3"], Bool[Array, "n 3"]]:
-    """The TLS translation of each axis (13), and the points that agree with it.
+    """Estimate the TLS translation of each axis (13), and find the points that agree with it.
 
     Runs in float64 whatever the dtype of the offsets.
 
@@ -48,7 +48,7 @@ def translation_of_points(
     confidence: Float[Array, " n"],
     chosen: Bool[Array, "n 3"],
 ) -> Float[Array, "3"]:
-    """The weighted mean of each axis over its chosen points, weights confidence / beta^2.
+    """Compute the weighted mean of each axis over its chosen points, weights confidence / beta^2.
 
     An axis without points gets 0. Gradients: exact.
     """

@@ -122,7 +122,7 @@ def evidence_of(
 
 
 def status_of(evidence: Evidence) -> Int[Array, ""]:
-    """The verdict: the status of the first question that the evidence fails, or OK."""
+    """Give the verdict: the status of the first question that the evidence fails, or OK."""
     e = evidence
     by_chance = (e.distinct <= 3) | (e.log_false_alarms > LARGEST_LOG_FALSE_ALARMS)
     questions = (
@@ -140,7 +140,7 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
 
 
 def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a reflection explains the clique better than the pose does.
+    """Tell whether a reflection explains the clique better than the pose does.
 
     Lengths do not tell left from right, so a mirrored cloud makes as large a clique as a right one; its
     flat parts then fit a rotation by themselves.
@@ -155,7 +155,7 @@ def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array
 
 
 def repeats(problem: Problem) -> Bool[Array, " n"]:
-    """Which matches are exact copies of an earlier row.
+    """Tell which matches are exact copies of an earlier row.
 
     Each row is sent to a slot by a hash of its numbers, and compared with the first row that came
     there. Two different rows in one slot hide copies from each other: one in sixteen at most.
@@ -174,7 +174,7 @@ def repeats(problem: Problem) -> Bool[Array, " n"]:
 
 
 def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:
-    """Whether the inliers fix the rotation (and with it the scale).
+    """Tell whether the inliers fix the rotation (and with it the scale).
 
     Turning the pose by an angle about its weakest axis raises the cost (6) by
     2 s (1 - cos angle)(tr M - largest eigenvalue of M), with M = R^T H the symmetric part of the
@@ -198,7 +198,7 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
 def log_false_alarms(
     problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"]
 ) -> Float[Array, ""]:
-    """The logarithm of the expected number of poses with as many inliers if all matches were wrong.
+    """Estimate the log of the expected number of poses with as many inliers if all matches were wrong.
 
     Three matches that agree on their distances make a pose; the rest of its inliers must come by
     chance. So: the number of triangles in a random graph of the same degrees, times the
@@ -226,7 +226,7 @@ def log_false_alarms(
 
 
 def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Int[Array, " k"]:
-    """How many further matches agree with poses through one inlier, turned evenly over SO(3).
+    """Count the further matches that agree with poses through one inlier, turned evenly over SO(3).
 
     Inliers that huddle within the noise stay together whatever the turn, and many-to-one matches
     too: they count as chance, as they should.
@@ -256,7 +256,7 @@ def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> 
 
 
 def _even_rotations(count: int, smallest_angle: float) -> np.ndarray:
-    """Rotations spread evenly over SO(3) by the super-Fibonacci spiral (Alexa, CVPR 2022), far from none."""
+    """Spread rotations evenly over SO(3) by the super-Fibonacci spiral (Alexa, CVPR 2022), no small ones."""
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041

@@ -38,7 +38,7 @@ def studies() -> dict[str, Study]:
 
 
 def _without(others: list[Method], *words: str) -> Iterator[Method]:
-    """Leave out those whose name holds one of the words."""
+    """Leave out the methods whose name holds one of the words."""
     return (each for each in others if not any(word in each.name for word in words))
 
 

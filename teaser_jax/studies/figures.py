@@ -134,7 +134,7 @@ def _drawn(numbers: np.ndarray, measure: Measure) -> np.ndarray:
 
 
 def _page(results: Results) -> str:
-    """Draw with plotly and return the page, which needs nothing from anywhere."""
+    """Draw the page of a study with plotly and return its text, which needs nothing from anywhere."""
     go, make_subplots = _plotly()
     panels, shown, colors = list(_panels(results)), set(), _colors(results)
     count = len(panels) + 1

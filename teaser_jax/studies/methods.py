@@ -95,7 +95,7 @@ def one_by_one(name: str, *, suits: Callable[[Trial], bool] | None = None, **cho
 
 
 def few_right(trial: Trial) -> bool:
-    """Whether the semidefinite relaxation can take the clique of a trial."""
+    """Tell whether the semidefinite relaxation can take the clique of a trial."""
     return bool(trial.problem.inliers.sum() <= SDP_MOST)
 
 
@@ -273,7 +273,7 @@ def _each(
     *,
     compiles: bool = True,
 ) -> Callable[[list[Trial], Mesh | None], list[Row]]:
-    """Ask about trials one by one: the seconds of ``solve``, warm, and what ``judge`` says of its answer."""
+    """Make a ``run`` that asks about trials one by one: warm seconds of ``solve``, what ``judge`` says."""
     once = _Once()
 
     def run(trials: list[Trial], mesh: Mesh | None) -> list[Row]:
@@ -289,14 +289,14 @@ def _each(
 
 
 def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What a call returns, and its seconds."""
+    """Time a call, and return its result and its seconds."""
     start = time.perf_counter()
     found = call()
     return found, time.perf_counter() - start
 
 
 class _Once:
-    """It runs something the first time a size comes, so that no compilation is timed, no start of threads."""
+    """Runs something the first time a size comes, so that no compilation is timed, no start of threads."""
 
     def __init__(self) -> None:
         self.seen: set[int] = set()

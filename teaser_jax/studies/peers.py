@@ -23,7 +23,7 @@ FAR = 1.0  # largest distance of ICP's closest points: the model's size
 
 
 class Question(NamedTuple):
-    """A problem as a library takes it.
+    """A problem as another library takes it.
 
     Attributes:
         solve: The library's call on arrays, clouds and settings that are made; may be repeated. Returns what
@@ -35,7 +35,7 @@ class Question(NamedTuple):
     pose: Callable[[Any], Pose]
 
     def answer(self) -> Pose:
-        """The pose, where nobody looks at the clock."""
+        """Return the pose, where nobody looks at the clock."""
         return self.pose(self.solve())
 
 
@@ -119,7 +119,7 @@ def _ransac(
 def _ransac_in(
     src: np.ndarray, dst: np.ndarray, bound: float, scale: float | None, *, seconds: float
 ) -> Question:
-    """RANSAC with a time-out, which Open3D does not have: as many iterations as fit into it."""
+    """Make a question for RANSAC with a time-out, which Open3D lacks: as many iterations as fit into it."""
     # On matches that are all wrong, for it stops early on right ones and would seem too fast.
     trial = _ransac(src, np.roll(dst, 1, axis=0), bound, scale, iterations=FIRST_ITERATIONS)
     start = time.perf_counter()
@@ -131,7 +131,10 @@ def _ransac_in(
 def _fast_global_registration(
     src: np.ndarray, dst: np.ndarray, bound: float, scale: float | None
 ) -> Question:
-    """FGR; an unknown scale is Horn's, as in the paper: the ratio of the extents about the centroids."""
+    """Make a question for FGR.
+
+    An unknown scale is Horn's, as in the paper: the ratio of the extents about the centroids.
+    """
     from open3d.pipelines import registration as r
 
     target, rows = _cloud(dst), _row_with_row(len(src))
@@ -155,7 +158,7 @@ def _fast_global_registration(
 
 
 def _icp(src: np.ndarray, dst: np.ndarray, bound: float, scale: float | None) -> Question:
-    """ICP from where the clouds are; it does not see the matches."""
+    """Make a question for ICP, which starts from where the clouds are and does not see the matches."""
     from open3d.pipelines import registration as r
 
     clouds = [_cloud(np.unique(x, axis=0)) for x in (src, dst)]
@@ -192,7 +195,7 @@ MAKERS = {"teaserpp_python": _teaserpp, "kiss-matcher": _kiss_matcher, "open3d":
 
 @functools.cache
 def find_peers() -> tuple[dict[str, Peer], dict[str, str]]:
-    """The peers of this environment by name, and why each missing package is missing."""
+    """Find the peers of this environment by name, and why each missing package is missing."""
     peers: dict[str, Peer] = {}
     missing: dict[str, str] = {}
     for package, make in MAKERS.items():

@@ -71,7 +71,7 @@ class Results:
         return np.array([row[column] for row in self.of(method, value) if column in row])
 
     def has(self, method: str, column: str) -> bool:
-        """Whether any row of a method has a number in a column."""
+        """Tell whether any row of a method has a number in a column."""
         return any(row["method"] == method and column in row for row in self.rows)
 
     def success(self, method: str, value: Number) -> float:

@@ -108,7 +108,7 @@ class _Work(NamedTuple):
             self.trial(value)
 
     def todo(self, known: set[tuple[Any, ...]]) -> Iterator[Todo]:
-        """List what is missing, of the methods that the first trial of a cell suits."""
+        """List the runs that are missing, of the methods that the first trial of a cell suits."""
         for value, numbers in self.cells:
             first = self.trial(value)
             for method in self.methods:
@@ -186,7 +186,7 @@ def _key(row: Row, study: Study) -> tuple[Any, ...]:
 
 
 def _opened(place: Path, work: _Work) -> Table:
-    """Open the table of a study in its folder, which must be of the same problems, and say who goes on."""
+    """Open the table of a study in its folder, which must be of the same problems; note this environment."""
     study = work.study
     about = {
         "study": study.name, "figure": study.figure, "title": study.title, "sweep": study.sweep,
@@ -256,7 +256,7 @@ def named_study(name: str) -> Study:
 
 
 def _chosen(study: Study, names: Sequence[str] | None, quick: bool) -> list[Method]:
-    """Choose those that take part by their names, or raise StudyError."""
+    """Choose the methods that take part by their names, or raise StudyError."""
     if names is None:
         return [each for each in study.methods if not (quick and each.slow)]
     known = {each.name: each for each in study.methods}

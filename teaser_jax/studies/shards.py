@@ -99,7 +99,7 @@ def read_trials(paths: str | Path | Sequence[str | Path]) -> Iterator[Trial]:
 
 
 def _shards(trials: Iterable[Trial], shard_bytes: int) -> Iterator[list[Trial]]:
-    """Group neighbours of one size, as many as fit into a file."""
+    """Group neighbouring problems of one size, as many as fit into a file."""
     for size, some in groupby(trials, key=lambda t: len(t.problem.src)):
         most, shard = max(1, shard_bytes // (49 * size + 200)), []
         for trial in some:

@@ -47,7 +47,7 @@ def _recolour(rows, classes, v, skip):
 
 @compiled
 def colour(candidates, rows, skip, order, colours, classes, uncoloured, available):
-    """Greedy colouring; lists only vertices whose colour exceeds ``skip``.
+    """Colour the candidates greedily; list only vertices whose colour exceeds ``skip``.
 
     A clique has at most one vertex of each colour, so only listed vertices can extend a clique by
     more than ``skip``.
@@ -95,7 +95,7 @@ def colour(candidates, rows, skip, order, colours, classes, uncoloured, availabl
 
 @compiled
 def root_bounds(rows, lower, bounds, last, budget):
-    """Colouring bound of each root: cliques whose latest vertex in the order is that root.
+    """Bound by colouring, for each root, the cliques whose latest vertex in the order is that root.
 
     Vertices come with the largest cores first. A root that cannot beat ``lower`` gets ``lower``.
     Works from vertex 0 upwards, starting at ``last``; returns the vertex to go on with.
@@ -132,7 +132,7 @@ def root_bounds(rows, lower, bounds, last, budget):
 
 @compiled
 def branch(rows, state, candidates, order, colours, listed, path, best, classes, scratch, budget):
-    """Branch and bound for a clique larger than ``state[1]``; resumable.
+    """Search for a clique larger than ``state[1]`` by branch and bound; resumable.
 
     ``state`` holds depth, size of the best clique, nodes visited, and whether the search began.
     ``best`` receives the members of every improvement.

@@ -40,10 +40,10 @@ class CliqueMethod(Protocol):
     prunes: ClassVar[bool]
 
     def on_device(self, edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> Clique:
-        """Go as far as the device goes; works under jit and vmap."""
+        """Find a clique, as far as the device goes; works under jit and vmap."""
 
     def is_settled(self, found: Clique) -> Bool[AnyArray, "*batch"]:
-        """Whether what the device has found leaves nothing to search for on the host."""
+        """Tell whether what the device has found leaves nothing to search for on the host."""
 
     def on_host(
         self, edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray, " n"], found: Clique

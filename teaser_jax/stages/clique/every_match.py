@@ -25,15 +25,15 @@ class EveryMatch:
     prunes: ClassVar[bool] = False
 
     def on_device(self, edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> Clique:
-        """All usable matches."""
+        """Take all usable matches."""
         return Clique(mask, jnp.sum(mask, dtype=jnp.int32))
 
     def is_settled(self, found: Clique) -> Bool[AnyArray, "*batch"]:
-        """Always: there is nothing to search for."""
+        """Return True for every graph: there is nothing to search for."""
         return namespace(found.upper_bound).ones_like(found.upper_bound, dtype=bool)
 
     def on_host(
         self, edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray, " n"], found: Clique
     ) -> Clique:
-        """What was found."""
+        """Return what the device has found."""
         return found

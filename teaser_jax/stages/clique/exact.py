@@ -60,24 +60,24 @@ class ExactClique:
         settle(self)
 
     def on_device(self, edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> Clique:
-        """The better of two greedy cliques, and the bound from peeling."""
+        """Find the better of two greedy cliques, and the bound from peeling."""
         return greedy_clique(edge_bits, mask, seeds=SEEDS_BEFORE_SEARCH)
 
     def is_settled(self, found: Clique) -> Bool[AnyArray, "*batch"]:
-        """Whether the device has proved its clique."""
+        """Tell whether the device has proved its clique."""
         return found.proved
 
     def on_host(
         self, edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray, " n"], found: Clique
     ) -> Clique:
-        """The maximum clique, or the best one within the budget."""
+        """Find the maximum clique, or the best one within the budget."""
         return search_clique(edge_bits, found, nodes=int(self.nodes), seconds=float(self.seconds))
 
 
 def search_clique(
     edge_bits: UInt32[np.ndarray, "n w"], found: Clique, *, nodes: int, seconds: float
 ) -> Clique:
-    """The maximum clique of a packed graph, or the best found within the budget.
+    """Find the maximum clique of a packed graph, or the best one within the budget.
 
     Where numba cannot be had, networkx searches instead, exactly but slowly and without budget.
 
@@ -100,7 +100,7 @@ class _OutOfBudget(Exception):
 
 
 class _Search:
-    """One search. ``best`` (original numbers) and ``upper`` are valid at any moment."""
+    """One search for the maximum clique. ``best`` (original numbers) and ``upper`` are always valid."""
 
     def __init__(
         self, edge_bits: UInt32[np.ndarray, "n w"], found: Clique, nodes: int, seconds: float
@@ -118,7 +118,7 @@ class _Search:
         self.names = np.arange(self.n)  # original number of each vertex of `rows`
 
     def run(self) -> Clique:
-        """Search until the maximum is proved or a budget is spent."""
+        """Search the graph until the maximum is proved or a budget is spent."""
         with suppress(_OutOfBudget):  # best and upper say how far it came
             self.reduce()
             self.order_and_branch()
@@ -132,7 +132,7 @@ class _Search:
             raise _OutOfBudget
 
     def lower_upper(self, bound: int) -> bool:
-        """Record a proved bound; True if it closes the search."""
+        """Record a proved bound; return True if it closes the search."""
         self.upper = max(len(self.best), min(self.upper, bound))
         return self.upper == len(self.best)
 
@@ -177,7 +177,7 @@ class _Search:
         self.lower_upper(int(core.max()) + 1)
 
     def colours(self) -> int:
-        """How many colours do for the whole graph: half the bound of the cores, for next to nothing."""
+        """Count the colours that do for the whole graph: half the bound of the cores, for next to nothing."""
         n, width = self.rows.shape
         everyone = np.zeros(64 * width, bool)
         everyone[:n] = True
@@ -188,7 +188,7 @@ class _Search:
         return int(used)
 
     def grow(self, *, patience: float) -> bool:
-        """Greedy cliques from vertices in no clique so far, until ``patience`` of them are no larger."""
+        """Grow greedy cliques from vertices in no clique so far, until ``patience`` of them are no larger."""
         clique = np.empty(len(self.names) + 1, np.int64)
         covered = np.zeros(len(self.names), bool)
         improved, idle = False, 0
@@ -208,7 +208,7 @@ class _Search:
         return improved
 
     def truss(self) -> int:
-        """Drop edges with too few common neighbours for a larger clique; how many there were."""
+        """Drop edges with too few common neighbours for a larger clique, and count them."""
         degree = self.reduction.degrees(self.rows)
         removed, row = 0, len(self.names) - 1
         while row >= 0:
@@ -284,7 +284,7 @@ class _Search:
 
 
 def _as_words(edge_bits: UInt32[np.ndarray, "n w"]) -> UInt64[np.ndarray, "n v"]:
-    """Rows of 32-bit words as rows of 64-bit words: the same bits, lower half first."""
+    """Turn rows of 32-bit words into rows of 64-bit words: the same bits, lower half first."""
     bits = np.ascontiguousarray(edge_bits, np.uint32)
     bits = np.pad(bits, ((0, 0), (0, bits.shape[1] % 2)))
     low, high = bits[:, 0::2].astype(np.uint64), bits[:, 1::2].astype(np.uint64)
@@ -292,13 +292,13 @@ def _as_words(edge_bits: UInt32[np.ndarray, "n w"]) -> UInt64[np.ndarray, "n v"]
 
 
 def _unpack(row: UInt64[np.ndarray, " v"], n: int) -> Bool[np.ndarray, " n"]:
-    """A row of 64-bit words as a mask of n vertices."""
+    """Unpack a row of 64-bit words into a mask of n vertices."""
     little = row.astype("<u8", copy=False).view(np.uint8)
     return np.unpackbits(little, bitorder="little", count=n).astype(bool)
 
 
 def load_kernels() -> bool:
-    """Make the compiled loops ready; False without numba. Says one line if it has to compile."""
+    """Make the compiled loops ready; return False without numba. Say one line if they have to compile."""
     global _ready
     with _loading:
         if _ready:
@@ -324,7 +324,7 @@ def load_kernels() -> bool:
 
 
 def two_pentagons() -> UInt32[np.ndarray, "10 1"]:
-    """A graph that no bound settles before the search branches: two pentagons, joined vertex by vertex.
+    """Make a graph that no bound settles before the search branches: two pentagons, fully joined.
 
     Its largest cliques have 4 vertices, and it needs 6 colours.
     """

@@ -31,22 +31,22 @@ class GreedyClique:
     prunes: ClassVar[bool] = True
 
     def on_device(self, edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> Clique:
-        """The best clique, and the bound from peeling."""
+        """Find the best of some greedy cliques, and the bound from peeling."""
         return greedy_clique(edge_bits, mask)
 
     def is_settled(self, found: Clique) -> Bool[AnyArray, "*batch"]:
-        """Always: no search follows."""
+        """Return True for every graph: no search follows."""
         return namespace(found.upper_bound).ones_like(found.upper_bound, dtype=bool)
 
     def on_host(
         self, edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray, " n"], found: Clique
     ) -> Clique:
-        """What the device has found."""
+        """Return what the device has found."""
         return found
 
 
 def greedy_clique(edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"], *, seeds: int = SEEDS) -> Clique:
-    """The best of some greedy cliques, and a bound from peeling off vertices of low degree.
+    """Find the best of some greedy cliques, and a bound from peeling off vertices of low degree.
 
     Grows cliques from vertices of high degree, each outside the cliques before it, until one is
     proved maximum or the seeds are used up.
@@ -84,7 +84,7 @@ def greedy_clique(edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"], *, s
 
 
 def _grow(edge_bits: Array, degree: Array, index: Array, seed: Array) -> Array:
-    """A maximal clique through ``seed``: its neighbourhood, less whoever knows fewest of the rest.
+    """Grow a maximal clique through ``seed``: its neighbourhood, less whoever knows fewest of the rest.
 
     Dropping from a neighbourhood finds larger cliques than adding to a vertex, and takes few
     rounds, because whoever stands low goes at once.
@@ -114,7 +114,7 @@ def _grow(edge_bits: Array, degree: Array, index: Array, seed: Array) -> Array:
 def peeling_bound(
     edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"], lower: Int[Array, ""]
 ) -> tuple[Bool[Array, " n"], Int[Array, ""]]:
-    """Vertices that a clique larger than ``lower`` could have, and a bound on every clique.
+    """Find the vertices that a clique larger than ``lower`` could have, and a bound on every clique.
 
     Such a vertex has at least ``lower`` neighbours that have as many, and so on. If none is left,
     the bound is ``lower``: a clique of that size is maximum.

@@ -15,7 +15,7 @@ from teaser_jax.stages.clique.exact import ExactClique
 def maximum_clique(
     edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"], method: CliqueMethod = ExactClique()
 ) -> Clique:
-    """The clique of a consistency graph that a method finds, with a proved bound on every clique.
+    """Find a clique of a consistency graph by a method, with a proved bound on every clique.
 
     A method that needs the host is called back, once for a whole batch under ``vmap``, and only where
     the device leaves something to search for. Works under jit, vmap and scan on one device.
@@ -38,7 +38,7 @@ def maximum_clique(
 def search_on_device(
     method: CliqueMethod, edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]
 ) -> Clique:
-    """A clique as far as the device goes, with its bound."""
+    """Find a clique by a method as far as the device goes, with its bound."""
     return method.on_device(edge_bits, mask)
 
 

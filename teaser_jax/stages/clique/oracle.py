@@ -29,22 +29,22 @@ class NetworkxClique:
     prunes: ClassVar[bool] = True
 
     def on_device(self, edge_bits: UInt32[Array, "n w"], mask: Bool[Array, " n"]) -> Clique:
-        """A greedy clique, which the host does not look at."""
+        """Find a greedy clique, which the host does not look at."""
         return greedy_clique(edge_bits, mask, seeds=1)
 
     def is_settled(self, found: Clique) -> Bool[AnyArray, "*batch"]:
-        """Never: the oracle judges for itself."""
+        """Return False for every graph: the oracle judges for itself."""
         return namespace(found.upper_bound).zeros_like(found.upper_bound, dtype=bool)
 
     def on_host(
         self, edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray, " n"], found: Clique
     ) -> Clique:
-        """A maximum clique of the graph."""
+        """Find a maximum clique of the graph."""
         return networkx_clique(edge_bits, mask)
 
 
 def networkx_clique(edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray, " n"]) -> Clique:
-    """A maximum clique, exactly, slowly and without a budget."""
+    """Find a maximum clique, exactly, slowly and without a budget."""
     import networkx as nx
 
     members = np.zeros(mask.shape[0], bool)
@@ -54,7 +54,7 @@ def networkx_clique(edge_bits: UInt32[np.ndarray, "n w"], mask: Bool[np.ndarray,
 
 
 def graph_of(edge_bits: UInt32[AnyArray, "n w"], mask: Bool[AnyArray, " n"]) -> nx.Graph:
-    """The consistency graph as a ``networkx.Graph`` on the usable matches, to look inside."""
+    """Make a ``networkx.Graph`` of the consistency graph on the usable matches, to look inside."""
     import networkx as nx
 
     n = mask.shape[0]

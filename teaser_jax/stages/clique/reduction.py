@@ -18,7 +18,7 @@ LOW6 = np.uint64(63)
 
 @intrinsic
 def count_bits(_, word):
-    """Number of set bits."""
+    """Count the set bits of a word."""
 
     def emit(context, builder, signature, args):
         return builder.ctpop(args[0])
@@ -28,7 +28,7 @@ def count_bits(_, word):
 
 @intrinsic
 def lowest_bit(_, word):
-    """Index of the lowest set bit of a nonzero word."""
+    """Find the index of the lowest set bit of a nonzero word."""
 
     def emit(context, builder, signature, args):
         from llvmlite import ir
@@ -43,7 +43,7 @@ compiled = njit(cache=True, nogil=True)
 
 @compiled
 def degrees(rows):
-    """Number of neighbours of each vertex."""
+    """Count the neighbours of each vertex."""
     n, width = rows.shape
     out = np.zeros(n, np.int64)
     for v in range(n):
@@ -54,7 +54,7 @@ def degrees(rows):
 
 @compiled
 def induced(rows, keep):
-    """The subgraph on ``keep``, renumbered in that order."""
+    """Make the subgraph on ``keep``, renumbered in that order."""
     m, (n, width) = len(keep), rows.shape
     out = np.zeros((m, max((m + 63) >> 6, 1)), np.uint64)
     place, kept = np.empty(n, np.int64), np.zeros(width, np.uint64)
@@ -73,7 +73,7 @@ def induced(rows, keep):
 
 @compiled
 def degeneracy_order(rows):
-    """Vertices by repeated removal of the smallest degree, and their core numbers (Matula, Beck)."""
+    """Order vertices by repeated removal of the smallest degree; find their core numbers (Matula, Beck)."""
     n, width = rows.shape
     degree = degrees(rows)
     top = 0
@@ -112,7 +112,7 @@ def degeneracy_order(rows):
 
 @compiled
 def neighbours(rows, vertex):
-    """The neighbours of a vertex, in order."""
+    """List the neighbours of a vertex, in order."""
     width = rows.shape[1]
     m = 0
     for w in range(width):
@@ -169,7 +169,7 @@ def drop_strangers(rows, share, inside):
 
 @compiled
 def grow_clique(rows, seed, share, clique):
-    """A greedy clique through ``seed`` into ``clique``; returns its size.
+    """Grow a greedy clique through ``seed`` into ``clique``; return its size.
 
     Starts from all neighbours, drops those that know fewest of the rest until all know each other, then takes
     in whoever fits.
@@ -202,7 +202,7 @@ def grow_clique(rows, seed, share, clique):
 
 @compiled
 def peel(rows, degree, alive, least):
-    """Drop vertices of fewer than ``least`` living neighbours, repeatedly; returns how many live."""
+    """Drop vertices of fewer than ``least`` living neighbours, repeatedly; return how many live."""
     n, width = rows.shape
     stack, height, living = np.empty(n, np.int64), 0, 0
     for v in range(n):

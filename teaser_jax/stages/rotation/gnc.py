@@ -43,7 +43,7 @@ class Gnc:
 
 
 def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: float | Float[AnyArray, ""], dtype: Any) -> Rotation:
-    """The rotation that GNC-TLS ends at, and the TIMs that agree with it.
+    """Find the rotation that GNC-TLS ends at, and the TIMs that agree with it.
 
     The first fit uses all TIMs; if all agree with it, it is final. Otherwise they are weighed by
     ``gnc_weights``, under a control that grows round by round.
@@ -93,11 +93,11 @@ def gnc_rotation(tims: Tims, gnc: Gnc = Gnc(), *, cbar2: float | Float[AnyArray,
 def gnc_weights(
     r2: Float[Array, "*k"], gnc_mu: float | Float[AnyArray, ""], cbar2: float | Float[AnyArray, ""]
 ) -> Float[Array, "*k"]:
-    """The weight of each measurement under a control mu.
+    """Compute the weight of each measurement under a control mu.
 
     It is 1 below mu/(mu+1) c^2, 0 above (mu+1)/mu c^2, and c sqrt(mu (mu+1)) / r - mu between.
 
-    The derivative of ``gnc_cost`` by r^2.
+    It is the derivative of ``gnc_cost`` by r^2.
 
     Gradients: exact in all arguments; zero where the weight is 0 or 1.
 
@@ -113,7 +113,7 @@ def gnc_weights(
 def gnc_cost(
     r2: Float[Array, "*k"], gnc_mu: float | Float[AnyArray, ""], cbar2: float | Float[AnyArray, ""]
 ) -> Float[Array, "*k"]:
-    """The softened cost of each measurement under a control mu.
+    """Compute the softened cost of each measurement under a control mu.
 
     It is r^2 below the first threshold of ``gnc_weights``, c^2 above the second, and
     2 c r sqrt(mu (mu+1)) - mu (c^2 + r^2) between.

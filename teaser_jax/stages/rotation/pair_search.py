@@ -43,7 +43,7 @@ class PairSearch:
     needs_host: ClassVar[bool] = False
 
     def turn(self, m: Measurements) -> Float[Array, "3 3"]:
-        """The turn from the frame of the measurements to the best rotation that the pairs lead to."""
+        """Find the turn from the frame of the measurements to the best rotation that the pairs lead to."""
         return search_pairs(m)
 
 
@@ -55,7 +55,7 @@ class Candidates(NamedTuple):
 
 
 def polish(m: Measurements) -> Float[Array, "3 3"]:
-    """The turn from the candidate to the best of the rotations met when fitting inliers again and again.
+    """Find the turn from the candidate to the best rotation met when fitting inliers again and again.
 
     A local minimum of (12) is least squares on its own inliers, and only such a one can be certified.
     """
@@ -83,7 +83,7 @@ def polish(m: Measurements) -> Float[Array, "3 3"]:
 
 
 def search_pairs(m: Measurements) -> Float[Array, "3 3"]:
-    """The turn from the candidate to the best rotation that is found, its own minimum included.
+    """Find the turn from the candidate to the best rotation that pairs lead to, its own minimum included.
 
     Args:
         m: Measurements in the frame of a candidate, in units of their bounds. Two right ones are needed.
@@ -107,7 +107,7 @@ def search_pairs(m: Measurements) -> Float[Array, "3 3"]:
 
 
 def pair_hypotheses(m: Measurements) -> Candidates:
-    """The best rotations that carry two source vectors on the two of the target, by the truncated cost.
+    """Find the best rotations that carry two source vectors on the two of the target, by the truncated cost.
 
     The frame of a pair is its bisector and its normal, so that both measurements share the error.
     """
@@ -144,7 +144,7 @@ def pair_hypotheses(m: Measurements) -> Candidates:
 def _frames(
     a: Float[Array, "m 3"], b: Float[Array, "m 3"]
 ) -> tuple[Float[Array, "m 3 3"], Bool[Array, " m"]]:
-    """Orthonormal columns from the bisector and the normal of two vectors; are these fixed at all?"""
+    """Make orthonormal columns of bisector and normal of two vectors, and tell whether these are fixed."""
 
     def unit(x: Array) -> tuple[Array, Array]:
         length = jnp.sqrt(jnp.sum(x * x, axis=1, keepdims=True))

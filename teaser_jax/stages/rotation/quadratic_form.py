@@ -37,12 +37,12 @@ class Measurements(NamedTuple):
 
     @property
     def residuals(self) -> Float[AnyArray, "k 3"]:
-        """b_k - a_k."""
+        """The residuals R^T b_k - a_k."""
         return self.dst - self.src
 
     @property
     def inliers(self) -> Bool[Array, " k"]:
-        """Where theta is +1."""
+        """The measurements where theta is +1: those within the truncation."""
         return self.mask & (jnp.sum(self.residuals**2, axis=1) <= self.cbar2)
 
     @property
@@ -52,7 +52,7 @@ class Measurements(NamedTuple):
         return jnp.sum(jnp.where(self.mask, jnp.minimum(r2, self.cbar2), 0))
 
     def turned(self, rotation: Float[AnyArray, "3 3"]) -> Measurements:
-        """The same in the frame of another candidate, given from this one's."""
+        """Write the measurements in the frame of another candidate, ``rotation`` away from this one."""
         return self._replace(dst=so3.rotate(rotation.T, self.dst))
 
 
@@ -67,7 +67,7 @@ class Framed(NamedTuple):
 def in_frame_of(
     rotation: Any, src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any, dtype: Any = jnp.float64
 ) -> Framed:
-    """Vector pairs in units of their bounds and in the frame of a rotation.
+    """Write vector pairs in units of their bounds and in the frame of a rotation.
 
     Rows that are not finite or whose bound is not above zero are left out. A vector of no length has the
     same residual under every rotation: it is left out, too, and its cost kept.
@@ -99,7 +99,7 @@ def in_frame_of(
 
 
 def pair_matrix(src: Float[AnyArray, "k 3"], dst: Float[AnyArray, "k 3"]) -> Float[Array, "k 4 4"]:
-    """The symmetric P with q^T P q = b . R(q) a for every unit quaternion q, scalar last."""
+    """Make the symmetric P with q^T P q = b . R(q) a for every unit quaternion q, scalar last."""
     outer = dst[:, :, None] * src[:, None, :]
     inner = jnp.trace(outer, axis1=1, axis2=2)
     top = outer + jnp.swapaxes(outer, 1, 2) - inner[:, None, None] * jnp.eye(3, dtype=src.dtype)[None]
@@ -110,7 +110,7 @@ def pair_matrix(src: Float[AnyArray, "k 3"], dst: Float[AnyArray, "k 3"]) -> Flo
 
 
 def cost_blocks(m: Measurements) -> tuple[Float[Array, "k 4 4"], Float[Array, "k 4 4"]]:
-    """H+ and H-, with q^T H q = (r^2 +- c^2) / 2; zero for measurements that do not exist.
+    """Make H+ and H-, with q^T H q = (r^2 +- c^2) / 2; zero for measurements that do not exist.
 
     The cost of a measurement is q^T H+ q + theta q^T H- q.
     """
@@ -122,7 +122,7 @@ def cost_blocks(m: Measurements) -> tuple[Float[Array, "k 4 4"], Float[Array, "k
 
 
 def cost_matrix(m: Measurements) -> Float[Array, "n4 n4"]:
-    """Q, gauge-fixed: the clones are theta_k q, so the blocks (0, k) carry theta_k."""
+    """Make the cost matrix Q, gauge-fixed: the clones are theta_k q, so the blocks (0, k) carry theta_k."""
     plus, minus = cost_blocks(m)
     k = plus.shape[0]
     theta = jnp.where(m.inliers, 1, -1).astype(m.src.dtype)[:, None, None]

@@ -45,7 +45,7 @@ class Relaxation:
     needs_host: ClassVar[bool] = True
 
     def turn(self, m: Measurements) -> Float[Array, "3 3"]:
-        """The turn to the best rotation that the pairs and the relaxation lead to; ValueError inside jit."""
+        """Find the turn to the best rotation that pairs and relaxation lead to; ValueError inside jit."""
         turn = search_pairs(m)
         near = m.turned(turn)
         if not isinstance(near.src, jax.core.Tracer):  # what does not exist would be variables of the solver
@@ -98,7 +98,7 @@ class Rounded(NamedTuple):
 
 
 def solve_relaxation(m: Measurements) -> Rounded:
-    """Solve (23) and descend from what it rounds to; the candidate stays unless another one is better.
+    """Solve the relaxation (23) and descend from what it rounds to; keep the candidate if that is no better.
 
     Args:
         m: Concrete measurements, no padding, in the frame of a candidate, best a good one.
@@ -127,7 +127,7 @@ def solve_relaxation(m: Measurements) -> Rounded:
 def _polished(
     m: Measurements, quats: Float[Array, "t 4"]
 ) -> tuple[Float[Array, "t 3 3"], Float[Array, " t"]]:
-    """The minima that the candidates descend to, and their costs."""
+    """Find the minima that the candidates descend to, and their costs."""
 
     def descend(quat: Array) -> tuple[Array, Array]:
         turn = so3.rotation_from_quat(quat)
@@ -138,7 +138,7 @@ def _polished(
 
 
 def relax(cost_matrix: np.ndarray, *, accuracy: float = 1e-6, iterations: int = 20_000) -> Relaxed:
-    """Solve (23) for a cost matrix of (k + 1)^2 blocks.
+    """Solve the relaxation (23) for a cost matrix of (k + 1)^2 blocks.
 
     Args:
         cost_matrix: Q, symmetric, in units of c^2.
@@ -175,7 +175,7 @@ def relax(cost_matrix: np.ndarray, *, accuracy: float = 1e-6, iterations: int = 
 
 
 def rounded(z: np.ndarray, count: int = 4) -> np.ndarray:
-    """Unit quaternions, scalar last, that the leading vectors of Z hold in their first block."""
+    """Find the unit quaternions, scalar last, that the leading vectors of Z hold in their first block."""
     _, vectors = np.linalg.eigh(z)
     heads = vectors[:4, ::-1][:, :count].T
     lengths = np.linalg.norm(heads, axis=1)
@@ -183,7 +183,7 @@ def rounded(z: np.ndarray, count: int = 4) -> np.ndarray:
 
 
 def report(relaxed: Relaxed, cost: float) -> RelaxationReport:
-    """The words for it, given the cost of the rotation that it was rounded to."""
+    """Make the report of a relaxation, given the cost of the rotation that it was rounded to."""
     values = np.linalg.eigvalsh(relaxed.matrix)[::-1]
     largest = max(float(values[0]), np.finfo(float).tiny)
     rank = int(np.sum(values > RANK_TOLERANCE * largest))
@@ -243,7 +243,7 @@ def _free_numbers(x: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _packed(matrix: np.ndarray) -> np.ndarray:
-    """The lower triangle by columns, off the diagonal times the root of two, as the solver has it."""
+    """Pack the lower triangle by columns, off the diagonal times the root of two, as the solver has it."""
     column, row = np.triu_indices(len(matrix))
     return np.where(row == column, 1, np.sqrt(2)) * matrix[row, column]
 

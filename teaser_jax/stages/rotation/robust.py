@@ -27,7 +27,7 @@ class ListedTims(NamedTuple):
 def robust_rotation(
     listed: ListedTims, every: Tims | None, *, method: Gnc | PairSearch | Relaxation, cbar2: Float[Array, ""]
 ) -> Rotation:
-    """The rotation (12) of TIMs, and which of them agree with it.
+    """Find the rotation (12) of TIMs, and which of them agree with it.
 
     Args:
         listed: The TIMs that a search looks at: the ring of the clique, or those of given pairs.

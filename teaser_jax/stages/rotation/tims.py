@@ -48,7 +48,7 @@ def listed_tims(
     bounds: Float[Array, " k"],
     mask: Bool[Array, " k"],
 ) -> Tims:
-    """The set of TIMs that are given one by one. Source TIMs carry the scale already."""
+    """Make the set of TIMs that are given one by one. Source TIMs carry the scale already."""
     inverse2 = jnp.where(mask, 1 / jnp.where(mask, bounds, 1) ** 2, 0)
     columns = jnp.concatenate([src_tims, jnp.ones_like(src_tims[:, :1])], axis=1)
 
@@ -80,7 +80,7 @@ def complete_tims(
     noise_bound: Float[Array, " n"],
     mask: Bool[Array, " n"],
 ) -> Tims:
-    """The set of all TIMs among the points of the mask, in O(n^2) work but never O(n^2) numbers."""
+    """Make the set of all TIMs among the points of the mask, in O(n^2) work but never O(n^2) numbers."""
     dtype = src.dtype
 
     def weighed(rotation: Array, weigh: Weigh, visited: PairSlice) -> tuple[Array, Array]:
@@ -152,7 +152,7 @@ def descend(
 def correlation(
     weights: Float[Array, " k"], src_tims: Float[Array, "k 3"], dst_tims: Float[Array, "k 3"]
 ) -> Float[Array, "3 3"]:
-    """The correlation H = sum_k w_k b_k a_k^T, whose nearest rotation is the fit. Gradients: exact."""
+    """Compute the correlation H = sum_k w_k b_k a_k^T; its nearest rotation is the fit. Gradients: exact."""
     return jnp.einsum("k,ki,kj->ij", weights, dst_tims, src_tims, precision=lax.Precision.HIGHEST)
 
 
@@ -163,7 +163,7 @@ def correlation_of_pairs(
     confidence: Float[Array, " n"],
     chosen: UInt32[Array, "n w"],
 ) -> Float[Array, "3 3"]:
-    """The correlation H over the pairs that packed bit rows choose, with weights c_i c_j / delta_ij^2.
+    """Compute the correlation H over pairs that packed bit rows choose, with weights c_i c_j / delta_ij^2.
 
     Gradients: exact.
     """
@@ -178,7 +178,7 @@ def correlation_of_pairs(
 
 
 def _pair_correlation(weight: Array, visited: PairSlice) -> Array:
-    """The part of a visit in H, component by component."""
+    """Compute what a slice of pairs adds to the correlation H, component by component."""
     return jnp.stack(
         [jnp.stack([jnp.sum(weight * b * a) for a in visited.src_tims]) for b in visited.dst_tims]
     )

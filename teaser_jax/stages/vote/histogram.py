@@ -37,10 +37,10 @@ class MeasurementRows(Protocol):
     length: int  # of each row
 
     def row(self, k: Int[Array, ""]) -> Measured:
-        """Those of row k."""
+        """Compute the values and bounds of row k, and tell which of them vote."""
 
     def recall(self, k: Int[Array, " m"], i: Int[Array, " m"]) -> Measured:
-        """The i-th of row k, for many i and k."""
+        """Compute the value and bound of the i-th measurement of row k, for many i and k; tell which vote."""
 
 
 class Axis(NamedTuple):
@@ -51,14 +51,14 @@ class Axis(NamedTuple):
     unit: Float[Array, ""]
 
     def bin(self, x: Float[Array, " k"]) -> Int[Array, " k"]:
-        """The bin of each number: 0 is all below, then 1 .. BINS, and BINS + 1 all above."""
+        """Find the bin of each number: 0 is all below, then 1 .. BINS, and BINS + 1 all above."""
         positive = jnp.maximum(x, 0)
         z = positive / (positive + self.unit)
         place = (z - self.low) * (BINS / (self.high - self.low))
         return jnp.floor(jnp.clip(place, -1, BINS)).astype(jnp.int32) + 1
 
     def part(self, first: Int[Array, ""], last: Int[Array, ""]) -> Axis:
-        """The axis of the bins from the first to the last."""
+        """Make the axis of the bins from the first to the last."""
         width = (self.high - self.low) / BINS
         return self._replace(
             low=self.low + (first - 1).astype(width.dtype) * width,
@@ -66,12 +66,12 @@ class Axis(NamedTuple):
         )
 
     def middle(self) -> Float[Array, ""]:
-        """A number near the middle."""
+        """Find a number near the middle of the axis."""
         z = 0.5 * (self.low + self.high)
         return self.unit * z / (1 - z)
 
     def edges(self) -> Float[Array, " e"]:
-        """The left edges of the bins 1 .. BINS + 1; the last may be infinite."""
+        """Compute the left edges of the bins 1 .. BINS + 1; the last may be infinite."""
         z = self.low + _counting(BINS + 1).astype(self.low.dtype) * ((self.high - self.low) / BINS)
         inside = z < 1
         return jnp.where(inside, self.unit * z / jnp.where(inside, 1 - z, 1), jnp.inf)
@@ -90,7 +90,7 @@ class Histogram(NamedTuple):
 
 
 class Question(NamedTuple):
-    """What a pass leaves open."""
+    """What a pass over the measurements leaves open: the bins that may hold the best set."""
 
     axis: Axis
     centre: Float[Array, ""]  # offsets d are taken from here: near the answer, nothing cancels
@@ -107,7 +107,7 @@ class Question(NamedTuple):
         return self.upper >= self.gain
 
     def hull(self) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """The first and the last open bin."""
+        """Find the first and the last open bin."""
         index = _counting(BINS + 2)
         return jnp.min(jnp.where(self.open, index, BINS)), jnp.max(jnp.where(self.open, index, 1))
 
@@ -124,7 +124,7 @@ def vote_by_histogram(
     unit: Float[Array, ""],
     interval: tuple[Any, Any] = (0.0, jnp.inf),
 ) -> tuple[Bool[Array, ""], Float[Array, ""]]:
-    """The global optimum of sum_k min((x - s_k)^2 / alpha_k^2, c-bar^2) over x >= 0, s_k >= 0.
+    """Find the global optimum of sum_k min((x - s_k)^2 / alpha_k^2, c-bar^2) over x >= 0, s_k >= 0.
 
     The same as ``vote``, for measurements too many to hold: they are recomputed row by row.
 
@@ -218,7 +218,7 @@ def _sweep_open_bins(
 
 
 def most_ends(count: int) -> int:
-    """How many ends are swept at once: 32 sweeps would do for all of them, up to 8 million."""
+    """Count the ends that are swept at once: 32 sweeps would do for all of them, up to 8 million."""
     return min(max(count // 16, BINS), 1 << 19)
 
 
@@ -234,7 +234,7 @@ class Intervals(NamedTuple):
     voters: Bool[Array, " k"]
 
     def moments(self, cbar2: Array) -> tuple[Array, ...]:
-        """Weight, weight d, and what weight d^2 is above the truncation; zero of no voter."""
+        """Compute weight, weight d, and what weight d^2 is above the truncation; zero without a vote."""
         weight = jnp.where(self.voters, 1 / self.bound**2, 0)
         first = weight * self.offset
         return weight, first, first * self.offset - jnp.where(self.voters, cbar2, 0)
@@ -257,7 +257,7 @@ def _histogram(measurements: MeasurementRows, rows: Int[Array, ""], q: Question,
     around = jnp.concatenate([-jnp.inf * jnp.ones_like(edges[:1]), edges, jnp.inf * edges[:1]])
 
     def gain(inside: Array, bound: Array) -> Array:
-        """The most that an interval gains within a distance of its end."""
+        """Compute the most that an interval gains within a distance of its end."""
         return cbar2 - jnp.maximum(c - jnp.maximum(inside, 0) / bound, 0) ** 2
 
     def add(k: Array, sums: Histogram) -> Histogram:
@@ -285,7 +285,7 @@ def _histogram(measurements: MeasurementRows, rows: Int[Array, ""], q: Question,
 
 
 def _bounds(h: Histogram, q: Question, cbar2: Array, interval: tuple[Any, Any]) -> Question:
-    """What a histogram tells of the gain: in each bin the most possible, anywhere the most met."""
+    """Bound the gain by a histogram: in each bin the most possible, anywhere the most met."""
     edges, dtype = q.axis.edges(), q.centre.dtype
     counted = [x[None].astype(dtype) for x in (h.begun, h.ended)]
     entering = jnp.concatenate([jnp.stack(h.entering), counted[0]])
@@ -293,7 +293,7 @@ def _bounds(h: Histogram, q: Question, cbar2: Array, interval: tuple[Any, Any]) 
     begun, ended, touching = running_sums(entering), running_sums(leaving), h.begun + h.ended
 
     def gain_at(sums: Array, low: Array | float, high: Array | float) -> tuple[Array, Array, Array]:
-        """The most that one set gains anywhere in a range, where, and how wrong that may be.
+        """Compute the most that one set gains anywhere in a range, where, and how wrong that may be.
 
         Running sums cancel, the more so the larger the terms are that came and went before.
         """
@@ -341,7 +341,7 @@ def _sweep(
     cbar2: Array,
     interval: tuple[Any, Any],
 ) -> tuple[Bool[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The best set that lasts in some of the bins, from the ends inside them: ``best_set``."""
+    """Find the best set that lasts in some of the bins, from the ends inside them: ``best_set``."""
 
     def collect(k: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
         ids, count = found

@@ -36,7 +36,7 @@ def vote(
     criterion: Criterion = "tls",
     interval: tuple[Float[Array, ""] | float, Float[Array, ""] | float] = (-jnp.inf, jnp.inf),
 ) -> Vote:
-    """The global optimum of sum_k min((x - s_k)^2 / alpha_k^2, c-bar^2).
+    """Find the global optimum of sum_k min((x - s_k)^2 / alpha_k^2, c-bar^2).
 
     The estimate of a consensus set is its weighted mean (14). ``"consensus"`` takes the largest
     set instead of the cheapest (Remark 8), the cheaper of equals. Measurements with an infinite
@@ -97,7 +97,7 @@ def best_set(
     interval: tuple[Any, Any],
     candidates: Bool[Array, " m"] | None = None,
 ) -> tuple[Bool[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The best consensus set of a sweep: whether there is one, a number with which it agrees, its cost.
+    """Find the best consensus set of a sweep: whether there is one, a number with which it agrees, its cost.
 
     The cost is relative to calling everything an outlier.
 
@@ -124,14 +124,14 @@ def best_set(
 
 
 def _mean(weights: Float[Array, " k"], values: Float[Array, " k"]) -> Float[Array, ""]:
-    """The weighted mean, 0 of no weight; both sums in one product."""
+    """Compute the weighted mean, 0 without weight; both sums in one product."""
     both = jnp.stack([jnp.ones_like(values), values])
     total, above = jnp.matmul(both, weights, precision=lax.Precision.HIGHEST)
     return above / jnp.where(total > 0, total, 1)
 
 
 def running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
-    """Cumulative sums along each row, in products with triangles of ones.
+    """Compute cumulative sums along each row, in products with triangles of ones.
 
     The rows are cut in pieces, summed inside each, and the totals of the pieces are summed the
     same way. XLA would make log m passes of ``cumsum`` on the CPU, and compile each.
@@ -150,7 +150,7 @@ def running_sums(x: Float[Array, "c m"]) -> Float[Array, "c m"]:
 
 
 def argsort(keys: Float[Array, " m"]) -> Array:
-    """Indices that sort the keys, index and key packed into one integer where it has room.
+    """Find the indices that sort the keys, index and key packed into one integer where it has room.
 
     XLA sorts single integers on the CPU four times as fast as keys with a payload. Packing drops
     the lowest bits of a float64 key, so ends closer than 1e-9 of their size may swap; a swapped
