@@ -107,6 +107,20 @@ def test_files_and_functions_are_short(name):
             assert length <= MOST_LINES_OF_A_FUNCTION, f"{node.name} has {length} lines"
 
 
+NO_VERB = set("A An The All Both Each Every How One That This Those What Where Whether Which".split())
+
+
+@pytest.mark.parametrize("name", ORDER)
+def test_docstrings_of_functions_begin_with_a_verb(name):
+    """In a tooltip a docstring stands alone: it says what the function does, and not what something is."""
+    for node in ast.walk(ast.parse(modules()[name].read_text())):
+        if isinstance(node, ast.FunctionDef) and not any(
+            "property" in ast.unparse(d) for d in node.decorator_list
+        ):
+            told = ast.get_docstring(node)
+            assert told is None or told.split()[0] not in NO_VERB, f"{node.name}: {told}"
+
+
 def in_a_fresh_python(code: str) -> str:
     return subprocess.run(
         [sys.executable, "-c", code], capture_output=True, check=True, text=True

@@ -31,7 +31,7 @@ from teaser_jax.ground.arrays import AnyArray, inside_jit
 from teaser_jax.stages.rotation.quadratic_form import Framed, in_frame_of
 
 QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
-COMPILED_AHEAD = 128  # measurements: programs of larger ones take longest to compile, and are rarely asked for
+COMPILED_AHEAD = 128  # measurements: larger programs take longest to compile and are rarely asked for
 
 Result = TypeVar("Result")
 
