@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections import Counter
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
-# Most of a test is compilation, and what is compiled runs for milliseconds: XLA optimises little here, which
-# takes a quarter of the time. `register`, `solve_batch` and certificates choose their own options, and keep
-# them. With TEASER_JAX_OPTIMIZED=1, as in `make slow`, all programs are those of a user.
+# Most of a test is compilation, and what is compiled runs for milliseconds: XLA optimises little here and
+# makes one piece of each program, which takes a quarter of the time. With TEASER_JAX_OPTIMIZED=1, as in
+# `make slow`, all programs are those of a user.
 if not os.environ.get("TEASER_JAX_OPTIMIZED"):
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    flags = "--xla_cpu_parallel_codegen_split_count=1"
     if tuple(map(int, version("jax").split(".")[:2])) < (0, 11):  # newer ones have no older emitters
-        flags = "--xla_cpu_use_fusion_emitters=false --xla_disable_hlo_passes=tree_reduction_rewriter"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
+        flags += " --xla_cpu_use_fusion_emitters=false --xla_disable_hlo_passes=tree_reduction_rewriter"
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
 
 import jax
 import jaxtyping
 import pytest
+
+# Tracing makes many small objects that stay: to look for cycles among them is a third of its time.
+gc.set_threshold(200_000, 20, 100)
 
 # Numba reads the source of these loops itself: they are loaded before anything is wrapped.
 import teaser_jax.stages.clique.branching

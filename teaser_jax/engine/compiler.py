@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import jax
 
+# More optimisation than this compiles longer and runs no faster. Who asks JAX for hardly any gets that.
+HARDLY_ANY = jax.config.values.get("jax_disable_most_optimizations", False)
+OPTIMISED = {"xla_backend_optimization_level": 0 if HARDLY_ANY else 1}
 # XLA splits each long sum into two kernels on the CPU: half as many again to compile, and no faster.
-WHOLE_SUMS = {"xla_disable_hlo_passes": "tree_reduction_rewriter", "xla_backend_optimization_level": 1}
+WHOLE_SUMS = {"xla_disable_hlo_passes": "tree_reduction_rewriter"} | OPTIMISED
 # Lengths of a million pairs: an eighth of the time is saved where the CPU has such vectors.
 WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
 # Its older emitters compile in two thirds of the time. What they make of the small kernels behind the
