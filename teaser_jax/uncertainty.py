@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -158,8 +158,24 @@ def _checked(sigma: Any, problem: Problem) -> Any:
     return sigma
 
 
-@partial(jax.jit, static_argnames="convention")
 def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Convention) -> Uncertainty:
+    # The fit and its slope are one program for all conventions.
+    pose = jax.tree.map(jnp.asarray, solution.pose)
+    return _at_the_origin(_about_the_middle(problem, solution, sigma), pose, convention)
+
+
+class _Central(NamedTuple):
+    """Covariance and information in source axes, about the inliers' middle, and what they are worth."""
+
+    covariance: Float[Array, "d d"]
+    information: Float[Array, "d d"]
+    known: Bool[Array, ""]
+    exact: Bool[Array, ""]
+    middle: Float[Array, "3"]
+
+
+@jax.jit
+def _about_the_middle(problem: Problem, solution: Solution, sigma: Any) -> _Central:
     p, _ = clean(problem)
     pose = jax.tree.map(jnp.asarray, solution.pose)
     deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)
@@ -184,17 +200,24 @@ def _covariance(problem: Problem, solution: Solution, sigma: Any, convention: Co
     least = jnp.linalg.eigvalsh(lax.stop_gradient(normalised))[0]
     exact = least <= 8 * jnp.finfo(found.dtype).eps  # some combination of coordinates has no noise at all
     inverse = unit[:, None] * jnp.linalg.inv(jnp.where(exact, eye, normalised)) * unit[None]
-    infinite = jnp.where(eye > 0, jnp.inf, 0.0)
-    to_origin = _moved_origin(middle * pose.scale, len(found))
-    from_origin = _moved_origin(-middle * pose.scale, len(found))
-    change = _change(pose, len(found), convention)
+    information = jnp.where(known & ~exact, inverse, 0)
+    return _Central(jnp.where(known, found, 0), information, known, exact, middle)
+
+
+@partial(jax.jit, static_argnames="convention")
+def _at_the_origin(central: _Central, pose: Pose, convention: Convention) -> Uncertainty:
+    d = len(central.covariance)
+    infinite = jnp.where(jnp.eye(d, dtype=bool), jnp.inf, jnp.zeros((), central.covariance.dtype))
+    to_origin = _moved_origin(central.middle * pose.scale, d)
+    from_origin = _moved_origin(-central.middle * pose.scale, d)
+    change = _change(pose, d, convention)
     forth = _product(change, to_origin)
     back = _product(from_origin, jnp.linalg.inv(change))
-    covariance = _product(_product(forth, jnp.where(known, found, 0)), forth.T)
-    information = _product(_product(back.T, jnp.where(known & ~exact, inverse, 0)), back)
+    covariance = _product(_product(forth, central.covariance), forth.T)
+    information = _product(_product(back.T, central.information), back)
     return Uncertainty(
-        covariance=jnp.where(known, covariance, infinite),
-        information=jnp.where(known, jnp.where(exact, infinite, information), 0),
+        covariance=jnp.where(central.known, covariance, infinite),
+        information=jnp.where(central.known, jnp.where(central.exact, infinite, information), 0),
         convention=convention,
     )
 

@@ -27,8 +27,8 @@ import pytest
 gc.set_threshold(200_000, 20, 100)
 
 # Numba reads the source of these loops itself: they are loaded before anything is wrapped.
-import teaser_jax.stages.clique.branching
-import teaser_jax.stages.clique.reduction
+import teaser_jax.stages.clique.branching  # noqa: E402
+import teaser_jax.stages.clique.reduction  # noqa: E402
 
 # Annotations are checked whenever a function is called or a record made: in what is imported from here on.
 jaxtyping.install_import_hook("teaser_jax", "typechecker.checked")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -16,13 +15,12 @@ from teaser_jax.stages.rotation.quadratic_form import Measurements, cost_matrix
 
 matrix_of, free_numbers_of, published = jax.jit(dual_matrix), jax.jit(dual_of), jax.jit(reference_guess)
 coupled = jax.jit(coupled_guess, static_argnames="correct_outliers")
+project, quadratic = jax.jit(project_dual), jax.jit(cost_matrix)
 
 
 def measurements(seed, k, wrong):
     src, dst, rotation = draw_vectors(seed, k, wrong)
-    return Measurements(
-        jnp.asarray(src / BOUND), jnp.asarray(dst / BOUND @ rotation), jnp.asarray(1.0), jnp.ones(k, bool)
-    )
+    return Measurements(src / BOUND, dst / BOUND @ rotation, np.asarray(1.0), np.ones(k, bool))
 
 
 @pytest.fixture(scope="module", params=["certification_small_1", "certification_small_2"])
@@ -34,7 +32,7 @@ def golden(request, data_dir):
 def of_golden(z) -> tuple[Measurements, float]:
     bound = float(z["param_noise_bound"])
     src, dst = z["v1"].T / bound, z["v2"].T / bound @ z["R_est"]
-    return Measurements(jnp.asarray(src), jnp.asarray(dst), jnp.asarray(1.0), jnp.ones(len(src), bool)), bound
+    return Measurements(src, dst, np.asarray(1.0), np.ones(len(src), bool)), bound
 
 
 def test_golden_matrices(golden, x64):
@@ -43,7 +41,7 @@ def test_golden_matrices(golden, x64):
     assert_allclose(float(m.cost) * bound**2, golden["mu"].item(), rtol=1e-12)
     # Theirs keeps the signs and is in the user's frame.
     signs = np.repeat(np.append(1.0, golden["theta_est"][0]), 4)
-    ours = np.array(cost_matrix(m)) * bound**2
+    ours = np.array(quadratic(m)) * bound**2
     turn = golden["block_diag_omega"]
     theirs = turn.T @ golden["Q_cost"] @ turn * signs[:, None] * signs
     assert_allclose(ours, theirs, atol=1e-12)
@@ -54,7 +52,7 @@ def test_golden_matrices(golden, x64):
     corner[:4, :4] = golden["mu"].item() * np.eye(4)
     theirs = turn.T @ golden["Q_cost"] @ turn - corner - golden["lambda_bar_init"]
     assert_allclose(first, theirs, atol=1e-9)
-    moved = np.array(project_dual(jnp.asarray(golden["W_1st_iter"] * gauge), jnp.ones(k + 1))) * gauge
+    moved = np.array(project(golden["W_1st_iter"] * gauge, np.ones(k + 1))) * gauge
     assert_allclose(moved, golden["W_dual_1st_iter"], atol=1e-9)
     assert_allclose(first + moved, golden["M_affine_1st_iter"], atol=1e-9)
 
@@ -78,7 +76,7 @@ def test_every_dual_bounds_the_cost_of_every_rotation(seed, wrong, x64):
     src, dst, rotation = draw_vectors(seed, k, wrong)
     m = measurements(seed, k, wrong)
     rng = np.random.default_rng(seed)
-    random = Dual(jnp.asarray(rng.normal(size=(k + 1, k + 1, 6))), jnp.asarray(rng.normal(size=(k, 4, 4))))
+    random = Dual(rng.normal(size=(k + 1, k + 1, 6)), rng.normal(size=(k, 4, 4)))
     rotations = [turned(rotation, angle, s) for s, angle in enumerate(np.linspace(0, 180, 200))]
     least = min(rotation_cost(src, dst, r) for r in rotations)
     for dual in (random, published(m), coupled(m, correct_outliers=True)):
@@ -91,11 +89,10 @@ def test_projection_is_one(x64):
     rng = np.random.default_rng(0)
     n = 6
     w, v = (x + x.T for x in rng.normal(size=(2, 4 * n, 4 * n)))
-    exists = jnp.ones(n)
-    project = lambda x: np.asarray(project_dual(jnp.asarray(x), exists))
-    p = project(w)
-    assert_allclose(project(p), p, atol=1e-12)  # idempotent
-    assert_allclose(np.sum(p * v), np.sum(w * project(v)), atol=1e-10)  # self-adjoint
+    projected = lambda x: np.asarray(project(x, np.ones(n)))
+    p = projected(w)
+    assert_allclose(projected(p), p, atol=1e-12)  # idempotent
+    assert_allclose(np.sum(p * v), np.sum(w * projected(v)), atol=1e-10)  # self-adjoint
     assert_allclose(p @ np.tile([0, 0, 0, 1], n), 0, atol=1e-12)  # annihilates the candidate
     blocks = p.reshape(n, 4, n, 4)
     assert_allclose(sum(blocks[i, :, i, :] for i in range(n)), 0, atol=1e-12)

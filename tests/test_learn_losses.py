@@ -13,7 +13,12 @@ import teaser_jax as tj
 from teaser_jax import learn
 
 # Step by step each loss compiles dozens of programs.
-matching_loss = jax.jit(learn.matching_loss)
+matching_loss, rotation_loss, translation_loss = (
+    jax.jit(f) for f in (learn.matching_loss, learn.rotation_loss, learn.translation_loss)
+)
+point_loss, inlier_loss, keypoint_loss = (
+    jax.jit(f) for f in (learn.point_loss, learn.inlier_loss, learn.keypoint_loss)
+)
 
 
 def pose(seed: int) -> tj.Pose:
@@ -23,22 +28,21 @@ def pose(seed: int) -> tj.Pose:
 def test_pose_losses_are_the_errors(x64):
     a, b = pose(0), pose(1)
     errors = tj.metrics.errors(a, b)
-    assert learn.rotation_loss(a, b) == pytest.approx(float(errors.rotation), rel=1e-12)
-    assert learn.translation_loss(a, b) == pytest.approx(float(errors.translation), rel=1e-12)
+    assert rotation_loss(a, b) == pytest.approx(float(errors.rotation), rel=1e-12)
+    assert translation_loss(a, b) == pytest.approx(float(errors.translation), rel=1e-12)
     points = np.random.default_rng(0).normal(size=(10, 3))
     mask = np.arange(10) < 7
     apart = np.linalg.norm(np.asarray(a.apply(points) - b.apply(points)), axis=1)
-    assert learn.point_loss(a, b, points) == pytest.approx(apart.mean())
-    assert learn.point_loss(a, b, points, mask) == pytest.approx(apart[:7].mean())
+    assert point_loss(a, b, points) == pytest.approx(apart.mean())
+    assert point_loss(a, b, points, mask) == pytest.approx(apart[:7].mean())
 
 
 def test_pose_losses_take_batches(x64):
     stack = lambda *x: jax.tree.map(lambda *y: jnp.stack(y), *x)
     several, others = stack(pose(0), pose(1)), stack(pose(2), pose(3))
     points = np.random.default_rng(0).normal(size=(2, 5, 3))
-    for loss in (learn.rotation_loss, learn.translation_loss, lambda a, b: learn.point_loss(a, b, points)):
+    for loss in (rotation_loss, translation_loss, lambda a, b: point_loss(a, b, points)):
         assert jax.eval_shape(loss, several, others).shape == (2,)
-    rotation_loss = jax.jit(learn.rotation_loss)
     np.testing.assert_allclose(rotation_loss(several, others)[1], rotation_loss(pose(1), pose(3)), rtol=1e-12)
 
 
@@ -51,8 +55,8 @@ def test_gradients_are_finite_at_every_angle(angle, x64):
     def loss(rotation):
         estimate = tj.Pose(rotation, truth.translation, truth.scale)
         points = jnp.zeros((4, 3)).at[1, 0].set(1.0)
-        total = learn.rotation_loss(estimate, truth) + learn.translation_loss(estimate, truth)
-        return total + learn.point_loss(estimate, truth, points)
+        total = rotation_loss(estimate, truth) + translation_loss(estimate, truth)
+        return total + point_loss(estimate, truth, points)
 
     value, slope = jax.jit(jax.value_and_grad(loss))(truth.rotation @ turn)
     assert np.isfinite(value)
@@ -64,22 +68,23 @@ def test_inlier_loss_is_balanced_cross_entropy(x64):
     logits, inliers, mask = rng.normal(size=(3, 20)), rng.random((3, 20)) < 0.2, rng.random((3, 20)) < 0.8
     each = np.asarray(optax.sigmoid_binary_cross_entropy(logits, inliers.astype(float)))
     expected = 0.5 * (each[mask & inliers].mean() + each[mask & ~inliers].mean())
-    assert learn.inlier_loss(logits, inliers, mask) == pytest.approx(expected)
+    assert inlier_loss(logits, inliers, mask) == pytest.approx(expected)
     # More wrong matches of the same kind change nothing.
     wrong = np.concatenate([logits, logits[:, ~inliers.any(axis=0)]], axis=1)
-    assert np.isfinite(learn.inlier_loss(wrong, np.zeros(wrong.shape, bool)))
+    assert np.isfinite(inlier_loss(wrong, np.zeros(wrong.shape, bool)))
 
 
 def test_keypoint_loss_saturates_and_draws_keypoints_together(x64):
     truth, src = pose(4), np.random.default_rng(0).normal(size=(8, 3))
     dst = np.array(truth.apply(src))
-    assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1) < 1e-20
+    assert keypoint_loss(src, dst, truth, noise_bound=0.1) < 1e-20
     dst[0] += 1e6
-    assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1) == pytest.approx(1 / 8)
-    assert learn.keypoint_loss(src, dst, truth, noise_bound=0.1, mask=np.arange(8) > 0) < 1e-20
+    assert keypoint_loss(src, dst, truth, noise_bound=0.1) == pytest.approx(1 / 8)
+    assert keypoint_loss(src, dst, truth, noise_bound=0.1, mask=np.arange(8) > 0) < 1e-20
     off = src + 0.05
-    loss = lambda src: learn.keypoint_loss(src, dst, truth, noise_bound=0.1)
-    assert loss(off - 0.01 * jax.jit(jax.grad(loss))(jnp.asarray(off))) < loss(off)
+    loss = jax.jit(jax.value_and_grad(lambda src: keypoint_loss(src, dst, truth, noise_bound=0.1)))
+    before, slope = loss(off)
+    assert loss(off - 0.01 * np.asarray(slope))[0] < before
 
 
 def test_matching_loss_by_hand(x64):
@@ -101,9 +106,9 @@ def test_nothing_to_learn_from_is_zero_with_gradient_zero():
     src, a = jnp.zeros((5, 3)), jnp.ones((5, 4))
     losses = [
         lambda a: learn.matching_loss(a, a, src, src + 9, truth, radius=0.1),
-        lambda a: learn.inlier_loss(a[:, 0], nothing, nothing),
-        lambda a: learn.keypoint_loss(a[:, :3], src, truth, noise_bound=0.1, mask=nothing),
-        lambda a: learn.point_loss(truth, pose(7), a[:, :3], nothing),
+        lambda a: inlier_loss(a[:, 0], nothing, nothing),
+        lambda a: keypoint_loss(a[:, :3], src, truth, noise_bound=0.1, mask=nothing),
+        lambda a: point_loss(truth, pose(7), a[:, :3], nothing),
     ]
     for loss in losses:
         value, slope = jax.jit(jax.value_and_grad(loss))(a)
@@ -154,11 +159,17 @@ def test_losses_of_what_is_no_number_are_none():
     one = tj.Pose(np.eye(3), np.zeros(3), np.asarray(1.0))
     lost = tj.Pose(np.full((3, 3), np.nan), np.full(3, np.nan), np.asarray(np.nan))
     points = np.ones((4, 3), np.float32)
-    assert np.isnan(learn.rotation_loss(lost, one))
-    assert np.isnan(learn.translation_loss(lost, one))
-    assert np.isnan(learn.point_loss(lost, one, points))
-    assert np.isnan(learn.point_loss(one, one, np.nan * points))
-    assert np.isnan(learn.keypoint_loss(points, points, lost, noise_bound=0.1))
+    assert np.isnan(rotation_loss(lost, one))
+    assert np.isnan(translation_loss(lost, one))
+    assert np.isnan(point_loss(lost, one, points))
+    assert np.isnan(point_loss(one, one, np.nan * points))
+    assert np.isnan(keypoint_loss(points, points, lost, noise_bound=0.1))
+
+
+@jax.jit
+def keypoint_slope(dst, src):
+    one = tj.Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.float32(1))
+    return jax.grad(lambda dst: learn.keypoint_loss(src, dst, one, noise_bound=0.5))(dst)
 
 
 @pytest.mark.parametrize("kind", [np.int32, np.float16, np.float32])
@@ -166,10 +177,10 @@ def test_losses_of_what_is_no_number_are_none():
 def test_keypoints_of_every_type_and_distance(kind, far):
     one = tj.Pose(np.eye(3, dtype=np.float32), np.zeros(3, np.float32), np.float32(1))
     src = np.zeros((5, 3), kind)
-    loss = lambda dst: learn.keypoint_loss(src, dst, one, noise_bound=0.5)
+    loss = lambda dst: keypoint_loss(src, dst, one, noise_bound=0.5)
     dst = src + np.asarray(far, kind)
     assert loss(dst) == pytest.approx(3 * far**2 / (0.25 + 3 * far**2), rel=1e-3)
-    assert np.isfinite(jax.jit(jax.grad(loss))(dst.astype(np.float32))).all()
+    assert np.isfinite(keypoint_slope(dst.astype(np.float32), src)).all()
 
 
 def test_impossible_numbers_are_refused(unchecked):

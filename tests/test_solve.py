@@ -291,11 +291,15 @@ def test_every_setting_finds_the_right_matches(variant, x64):
 @pytest.mark.long
 def test_without_pruning_nothing_is_proved_and_eager_equals_jit(x64):
     matches, settings = matches_of(0, wrong=0.1), tj.Settings(clique="none")
-    solution = solve(problem_of(matches, scale=1.3), settings)
+    problem = problem_of(matches, scale=1.3)
+    solution = solve(problem, settings)
     assert int(solution.clique_size) == N
     assert not bool(solution.clique_is_maximum)
     assert pose_error(solution.pose, matches.truth) < 0.1
-    assert_same(jax.device_get(tj.solve(problem_of(matches, scale=1.3), settings)), solution)
+    # One method after the other: what JAX keeps of the first must not be run for the second.
+    greedy, every = (jax.device_get(tj.solve(problem, tj.Settings(clique=x))) for x in ("greedy", "none"))
+    assert int(greedy.selection.clique.sum()) < N
+    assert_same(every, solution)
 
 
 # --- dtypes ---------------------------------------------------------------------------------------

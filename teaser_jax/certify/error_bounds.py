@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from teaser_jax.certify.bounds import Bound, InlierSet
@@ -23,7 +22,7 @@ from teaser_jax.ground.checks import whole_number
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import cascade_pose
-from teaser_jax.solution import Solution
+from teaser_jax.solution import Selection, Solution
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def error_bounds(
     p, s = on_host((problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
     with jax.enable_x64(True):
-        cascade = jax.device_get(cascade_pose(clean(p)[0], jax.tree.map(jnp.asarray, s.selection)))
+        cascade = jax.device_get(_cascade(p, s.selection))
     agreed = InlierSet.of(p, cascade, s.selection.clique & s.selection.translation.all(axis=1))
     return ErrorBounds(
         whole_set(InlierSet.of(p, s.pose, s.inliers), wrong),
@@ -96,3 +95,9 @@ def error_bounds(
         contracts=contracts(p, s, agreed, certificate),
         certificate=certificate,
     )
+
+
+@jax.jit
+def _cascade(problem: Problem, selection: Selection) -> Pose:
+    """Compute the pose of the plain cascade on the chosen sets, as one program."""
+    return cascade_pose(clean(problem)[0], selection)

@@ -132,7 +132,7 @@ def with_blocks(found: Certificate, n: int) -> Certificate:
 
 def too_large(measurements: HostMeasurements, rotation: Float[np.ndarray, "3 3"]) -> Certificate:
     """Prove nothing of measurements that are too many to look at; the cost is known all the same."""
-    m, frame, constant = in_float64(lambda: jax.device_get(_framed(measurements, rotation)))
+    m, frame, constant = in_float64(lambda: jax.device_get(framed(measurements, rotation)))
     count = np.sum(m.mask)
     r2 = np.sum((m.dst - m.src) ** 2, axis=1)
     cost = np.where(m.mask, np.minimum(r2, measurements.cbar2), 0).sum() + constant
@@ -156,7 +156,7 @@ def too_large(measurements: HostMeasurements, rotation: Float[np.ndarray, "3 3"]
 
 
 @jax.jit
-def _framed(measurements: HostMeasurements, rotation: Float[Array, "3 3"]) -> Framed:
+def framed(measurements: HostMeasurements, rotation: Float[Array, "3 3"]) -> Framed:
     """Turn the measurements into the frame of the rotation, and nothing else."""
     return in_frame_of(rotation, **measurements._asdict())
 

@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertifiedBy
 from teaser_jax.certify.dual import Dual, dual_matrix
+from teaser_jax.certify.host import framed
 from teaser_jax.certify.host_measurements import HostMeasurements, without_padding
 from teaser_jax.certify.proof import Attempt, claim_of, lowest_if_unproved, read_off
 from teaser_jax.certify.semidefinite import reaches
-from teaser_jax.stages.rotation.quadratic_form import Measurements, in_frame_of
+from teaser_jax.stages.rotation.quadratic_form import Measurements
 from teaser_jax.stages.rotation.relaxation import RelaxationReport, report, solve_relaxation
 
 
@@ -39,14 +40,14 @@ def relaxed_rotation(
         tolerance: The suboptimality that counts as optimal [-].
     """
     with jax.enable_x64(True):
-        m, frame, constant = in_frame_of(rotation, **without_padding(measurements)._asdict())
+        m, frame, constant = framed(without_padding(measurements), rotation)
         best = solve_relaxation(m)
-        dual = Dual(jnp.asarray(best.relaxed.skew), jnp.asarray(best.relaxed.diagonal))
-        frame, rounds = frame @ best.turn, np.int32(best.relaxed.iterations)
+        dual = Dual(best.relaxed.skew, best.relaxed.diagonal)
+        frame, rounds = np.asarray(frame) @ best.turn, np.int32(best.relaxed.iterations)
         found = _certificate(m, frame, constant, dual, best.turn, np.float64(tolerance), rounds)
         cost = best.cost + float(constant)
         relaxation = report(best.relaxed, best.cost)
-        return RelaxedRotation(np.asarray(frame), cost, jax.device_get(found), relaxation)
+        return RelaxedRotation(frame, cost, jax.device_get(found), relaxation)
 
 
 @jax.jit

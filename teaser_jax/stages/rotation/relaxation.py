@@ -115,12 +115,15 @@ def solve_relaxation(m: Measurements) -> Rounded:
         )
     with jax.enable_x64(True):
         m = jax.tree.map(lambda x: np.asarray(x, np.float64 if x.dtype != bool else bool), m)
-        relaxed = relax(np.asarray(cost_matrix(m)))
+        relaxed = relax(np.asarray(_cost_matrix(m)))
         quats = np.concatenate([[[0, 0, 0, 1.0]], rounded(relaxed.matrix)])
         turns, costs = jax.device_get(_polished(m, quats))
         # A candidate that is as good as any stays, whatever rounding says.
         best = int(np.argmin(costs + 1e-9 * costs[0] * (np.arange(len(costs)) > 0)))
         return Rounded(turns[best], float(costs[best]), relaxed)
+
+
+_cost_matrix = jax.jit(cost_matrix)
 
 
 @jax.jit
