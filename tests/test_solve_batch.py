@@ -292,7 +292,8 @@ def run(name, *arguments, **variables):
 
 @pytest.mark.long
 def test_four_devices_give_the_bits_of_one():
-    forced = run("four_devices.py", XLA_FLAGS="--xla_force_host_platform_device_count=4")
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=4"
+    forced = run("four_devices.py", XLA_FLAGS=flags)
     out, _ = forced.communicate(timeout=300)
     said = json.loads(out.splitlines()[-1])
     assert said == {"devices": 4, "same": True, "right": 64, "compiled": 2}
