@@ -11,6 +11,7 @@ so that new ones compile nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias, get_args
 
 import jax
@@ -112,6 +113,14 @@ def check_settings(settings: Any) -> None:
     Raises:
         ValueError: If these are no settings, a method is none, or a number is missing or out of range.
     """
+    try:
+        _check_plain(settings)
+    except TypeError:  # numbers that have no hash, as those of arrays
+        _check(settings)
+
+
+def _check(settings: Any) -> None:
+    """Check settings whose numbers may be arrays or tracers."""
     if not isinstance(settings, Settings):
         raise ValueError(f"settings is {settings!r}: expected Settings, as in Settings(clique='greedy').")
     for name, known in METHODS.items():
@@ -119,3 +128,7 @@ def check_settings(settings: Any) -> None:
     if not isinstance(settings.refine, Refinement | None):
         one_of("Settings.refine", settings.refine, (True, False))
     settings.scale_search.check_concrete()
+
+
+# The same settings come thousands of times, and to look at every number is a twentieth of a small problem.
+_check_plain = lru_cache(maxsize=256)(_check)

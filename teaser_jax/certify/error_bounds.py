@@ -14,6 +14,7 @@ import numpy as np
 
 from teaser_jax.certify.bounds import Bound, InlierSet
 from teaser_jax.certify.certificate import Certificate
+from teaser_jax.certify.host import in_float64
 from teaser_jax.certify.paper_bounds import Contract, contracts, paper_bounds
 from teaser_jax.certify.pose import certify, on_host
 from teaser_jax.certify.whole_set import WholeSet, whole_set
@@ -85,8 +86,7 @@ def error_bounds(
     wrong = whole_number("wrong", wrong, 0, what="the number of inliers that may be wrong")
     p, s = on_host((problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
-    with jax.enable_x64(True):
-        cascade = jax.device_get(_cascade(p, s.selection))
+    cascade = in_float64(lambda: jax.device_get(_cascade(p, s.selection)))
     agreed = InlierSet.of(p, cascade, s.selection.clique & s.selection.translation.all(axis=1))
     return ErrorBounds(
         whole_set(InlierSet.of(p, s.pose, s.inliers), wrong),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -9,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from teaser_jax.certify.host import in_float64
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import cascade_pose
-from teaser_jax.solution import Solution
+from teaser_jax.solution import Selection, Solution
 from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
 
 About = Literal["pose", "chain", "complete"]
@@ -40,10 +42,8 @@ def subject_on_host(problem: Problem, solution: Solution, about: About) -> Subje
     """Choose the vectors to certify against, any number, on the host: problem and solution are in numpy."""
     if about == "pose":  # plain numpy: it is what is called most
         return _about_pose(problem, solution)
-    with jax.enable_x64(True):
-        members = int(np.sum(solution.selection.clique))
-        there = jax.tree.map(jnp.asarray, solution)
-        return jax.device_get(_about_tims(clean(problem)[0], there, about, members))
+    members = int(np.sum(solution.selection.clique)) if about == "complete" else 0
+    return in_float64(lambda: jax.device_get(_tims_on_host(problem, solution.selection, about, members)))
 
 
 def traced_subject(
@@ -63,7 +63,7 @@ def traced_subject(
     if about == "pose":
         subject = _about_pose(problem, solution)
     else:
-        subject = _about_tims(problem, solution, about, _most_members(about, most))
+        subject = _about_tims(problem, solution.selection, about, _most_members(about, most))
     size = min(most, subject.mask.shape[0])
     if about == "complete":
         too_many = jnp.sum(solution.selection.clique) > _most_members(about, most)
@@ -86,9 +86,13 @@ def _about_pose(problem: Problem, solution: Solution) -> Subject:
     return Subject(solution.pose.scale * a, b, p.noise_bound, keep, solution.pose.rotation)
 
 
-def _about_tims(problem: Problem, solution: Solution, about: About, members: int) -> Subject:
+@partial(jax.jit, static_argnames=("about", "members"))
+def _tims_on_host(problem: Problem, chosen: Selection, about: About, members: int) -> Subject:
+    return _about_tims(clean(problem)[0], chosen, about, members)
+
+
+def _about_tims(p: Problem, chosen: Selection, about: About, members: int) -> Subject:
     """Take the TIMs of the clique, source scaled; of all pairs those among its first ``members``."""
-    p, chosen = problem, solution.selection
     cascade = cascade_pose(p, chosen)
     clique = chosen.clique & p.mask
     if p.pairs is not None:
