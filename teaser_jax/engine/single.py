@@ -25,7 +25,7 @@ def solve_one(problem: Problem, settings: Settings) -> Solution:
     choices = jax.tree.structure(settings)
     with jax.enable_x64(True):
         graph, clique, settled = ON_ONE_DEVICE.before(sent, choices, near.edge_dtype)
-        if not settled:
+        if settings.clique.needs_host and not settled:  # to look at it is to wait for the device
             clique = finish_on_host(settings.clique, graph.edge_bits, sent.mask, clique)
         if settings.rotation.needs_host:  # step by step, with a solver on the host in between
             cleaned, excluded = clean(unpack_problem(sent))
