@@ -39,7 +39,7 @@ class Registration:
         pose: ``T_dst_src``.
         inliers: (n,) matches that the pose explains.
         status: What happened; ``status.advice`` says what to try.
-        solution: The same as a pytree of numpy arrays, with the sets behind the pose.
+        solution: Pose, status and the sets behind them, as a pytree of numpy arrays.
         problem: What was asked, as read: ``certify`` and ``refit`` take it with the solution.
     """
 
