@@ -28,7 +28,7 @@ class Question(NamedTuple):
     Attributes:
         solve: The library's call on arrays, clouds and settings that are made; may be repeated. Returns what
             the library returns.
-        pose: Reads that.
+        pose: Reads the pose off what ``solve`` returns.
     """
 
     solve: Callable[[], Any]
