@@ -69,6 +69,7 @@ def sleep(how_long: float) -> None:
     time.sleep(how_long)
 
 
+@pytest.mark.long
 def test_a_child_has_its_own_cores_and_nobodys_cache(monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", "of the parent")
     monkeypatch.setenv("PYTHONPATH", os.path.dirname(__file__))
@@ -77,6 +78,7 @@ def test_a_child_has_its_own_cores_and_nobodys_cache(monkeypatch):
     assert kept == [1, "own", "b"]
 
 
+@pytest.mark.long
 def test_a_child_that_takes_too_long_has_no_result(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.path.dirname(__file__))
     assert in_child(sleep, seconds=1.0, how_long=60.0) is None
@@ -99,6 +101,7 @@ def ask_to_sleep(how_long: float) -> Question:
     return Question(partial(time.sleep, how_long), lambda _: answer)
 
 
+@pytest.mark.long
 def test_a_crew_is_timed_inside_its_processes(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     with Crew(ask_to_sleep, processes=2) as crew:

@@ -28,6 +28,7 @@ def test_packing_is_the_plain_sum_of_powers(n):
     np.testing.assert_array_equal(packed, oracles.pack(mask_of(n)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", SIZES)
 def test_unpacking_undoes_packing(n):
     mask = mask_of(n)
@@ -65,6 +66,7 @@ def test_others_are_all_but_oneself(n):
     assert not every[:, n:].any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [1, 5, 32, 33, 100, 3000])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_rank_and_list(n, share):

@@ -29,6 +29,7 @@ def with_odd_mask(src, dst, rotation, bound):
     return certify_rotation(src, dst, rotation, noise_bound=bound, mask=[2] * 12)
 
 
+@pytest.mark.long
 def test_no_measurements():
     found = certify_rotation(np.zeros((0, 3)), np.zeros((0, 3)), np.eye(3), noise_bound=BOUND)
     assert found.status == CertificateStatus.NO_MEASUREMENTS
@@ -55,6 +56,7 @@ def test_a_tiny_cost_is_settled_by_the_absolute_gap():
     assert sound(src, dst, rotation, found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_few_measurements(k):
     for seed in range(3):
@@ -77,6 +79,7 @@ def test_a_plane_is_certified():
     assert sound(src, dst, best, found)
 
 
+@pytest.mark.long
 def test_a_line_may_be_certified_and_is_never_unique():
     rng = np.random.default_rng(0)
     src = np.linspace(-1, 1, 10)[:, None] * [1.0, 2.0, 3.0]
@@ -89,6 +92,7 @@ def test_a_line_may_be_certified_and_is_never_unique():
         assert sound(src, dst, rotation, found)
 
 
+@pytest.mark.long
 def test_no_inlier_claims_nothing():
     for seed in range(5):
         src, dst, _ = draw_vectors(seed, 10, 1.0)
@@ -126,6 +130,7 @@ def test_vectors_of_no_length_are_set_apart():
     assert not only.is_optimal
 
 
+@pytest.mark.long
 def test_duplicates_are_harmless():
     src, dst, _ = draw_vectors(5, 10, 0.2)
     src, dst = np.repeat(src, 2, axis=0), np.repeat(dst, 2, axis=0)
@@ -135,6 +140,7 @@ def test_duplicates_are_harmless():
     assert sound(src[::2], dst[::2], best, certify_rotation(src[::2], dst[::2], best, noise_bound=BOUND))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "make", [lambda r: -r, lambda r: 2 * r, lambda r: r + 0.1, lambda r: np.zeros((3, 3))]
 )

@@ -16,6 +16,7 @@ from teaser_jax.certify.verify import verify
 from teaser_jax.so3 import rotation_angle
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("k", [5, 20, 40])
 @pytest.mark.parametrize("wrong", [0.0, 0.2, 0.4, 0.6])
 def test_right_rotations_are_certified_and_the_proof_holds(k, wrong):
@@ -36,6 +37,7 @@ def test_right_rotations_are_certified_and_the_proof_holds(k, wrong):
             assert found.iterations == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("degrees", [1, 5, 30, 90, 180])
 @pytest.mark.parametrize("wrong", [0.0, 0.3, 0.6])
 def test_moved_rotations_are_never_optimal(degrees, wrong):

@@ -274,6 +274,7 @@ def test_a_bug_is_not_called_bad_input(matches, monkeypatch):
         cli.main(["register", str(matches), "--noise-bound", "1"])
 
 
+@pytest.mark.long
 def test_demo(tmp_path, small, capsys, monkeypatch):
     monkeypatch.setattr(tj.synthetic, "random_problem", lambda seed: small)
     path = tmp_path / "demo.png"
@@ -305,6 +306,7 @@ def test_version_and_help(capsys):
         assert text in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_as_a_program(tmp_path):
     path = tmp_path / "broken.npz"
     path.write_bytes(b"PK\x03\x04")

@@ -116,6 +116,7 @@ def check(case: Case, found: Clique, *, maximum: bool) -> None:
         assert members.sum() == case.number == int(found.upper_bound)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("special", [False, True], ids=["random", "special"])
 @pytest.mark.parametrize("method", ["greedy", "exact"])
 def test_every_set_is_a_clique_and_every_bound_holds(method, special):
@@ -148,6 +149,7 @@ def test_a_batch_equals_a_loop():
         assert int(alone.upper_bound) == together.upper_bound
 
 
+@pytest.mark.long
 def test_the_callback_equals_the_host_search():
     exactly, start = ExactClique(), jax.jit(search_on_device)
     for case, exact in zip(random_cases(), answers("exact", False), strict=True):

@@ -53,6 +53,7 @@ def check_against_exact(src, dst, bound, *, dtype=np.float64, scale=1.0, cbar2=1
     assert not extra.any(), f"{extra.sum() // 2} edges too many, by up to {(gap - limit)[extra].max():.1e}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("scale", [1.0, 0.3, 4.0])
 @pytest.mark.parametrize("bound", [1e-4, 0.05, 1.0])

@@ -35,6 +35,7 @@ def of_golden(z) -> tuple[Measurements, float]:
     return Measurements(src, dst, np.asarray(1.0), np.ones(len(src), bool)), bound
 
 
+@pytest.mark.long
 def test_golden_matrices(golden, x64):
     m, bound = of_golden(golden)
     k = len(m.src)
@@ -68,6 +69,7 @@ def test_golden_trajectories(name, data_dir, x64):
     assert_allclose(found.suboptimality, np.maximum(expected, 0), atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("wrong", [0.0, 0.4])
 def test_every_dual_bounds_the_cost_of_every_rotation(seed, wrong, x64):

@@ -63,6 +63,7 @@ def test_the_truth_lies_within_the_bound_in_all_of_500():
     assert informative >= 450
 
 
+@pytest.mark.long
 def test_some_of_the_inliers_may_be_wrong():
     drawn, result = registered(3, 100, 0.2)
     strict, loose = (tj.error_bounds(result.problem, result.solution, wrong=w) for w in (0, 4))
@@ -77,6 +78,7 @@ def test_some_of_the_inliers_may_be_wrong():
     assert np.all(loose.whole_set.at(drawn.src) >= strict.whole_set.at(drawn.src))
 
 
+@pytest.mark.long
 def test_any_pose_that_fits_as_well_lies_within_it():
     # Not the truth only: move the pose until an inlier leaves its bound.
     drawn, result = registered(1, 60, 0.3)
@@ -133,6 +135,7 @@ def test_the_bounds_of_the_paper_and_their_reasons():
     assert "cannot be checked" in repr(large)
 
 
+@pytest.mark.long
 def test_contracts_say_what_holds():
     drawn = tj.synthetic.random_problem(0, n=40, outlier_rate=0.25)
     exact = drawn.dst.copy()

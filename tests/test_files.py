@@ -145,6 +145,7 @@ def test_no_file_and_no_file_but_a_folder(tmp_path):
     assert "cannot be read" in reason(tmp_path / ("x" * 300 + ".npz"))
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     content=st.binary(max_size=300) | st.text(max_size=200).map(str.encode),

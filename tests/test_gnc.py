@@ -82,6 +82,7 @@ def gnc_by_the_book(data: Measured, cbar2: float, factor: float, iterations: int
     return rotation, residuals(rotation) <= cbar2, np.sum(weights > 0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("iterations", [1, 2, 5, 100])
 def test_every_round_follows_the_formulas(iterations):
     lost = 0
@@ -222,6 +223,7 @@ def test_correlation_of_packed_pairs_is_the_dense_sum():
     np.testing.assert_allclose(correlation(*map(jnp.asarray, (weights, a, b))), found, rtol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("members", [[], [4], [1, 6], [0, 2, 3], [5, 6, 7], range(8)], ids=str)
 def test_the_chain_is_a_closed_ring_in_the_users_order(members):
     clique = np.isin(np.arange(8), list(members))

@@ -86,6 +86,7 @@ def draw(seed, rows=20, tight=0.02, right=0.3):
     return values, bounds
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("tight", [1e-6, 0.02, 0.3])
 @pytest.mark.parametrize("right", [0.0, 0.05, 0.3, 1.0])
 def test_same_set_as_the_sweep(few_bins, tight, right):
@@ -96,6 +97,7 @@ def test_same_set_as_the_sweep(few_bins, tight, right):
         assert_same_set(values, bounds, mask=np.random.default_rng(seed).random(len(values)) < 0.6)
 
 
+@pytest.mark.long
 def test_the_cost_is_the_enumerated_optimum(few_bins):
     for seed in range(5):
         values, bounds = draw(seed, rows=4, right=0.1)
@@ -114,6 +116,7 @@ def test_only_sets_with_their_estimate_in_the_interval_compete(few_bins, interva
         assert_same_set(*draw(seed), interval=interval)
 
 
+@pytest.mark.long
 def test_two_peaks_apart_are_told_from_each_other(few_bins):
     # Equal but for one measurement: both stay open to the last pass.
     offsets = np.random.default_rng(0).uniform(-0.01, 0.01, 8 * LENGTH)
@@ -127,6 +130,7 @@ def test_two_peaks_apart_are_told_from_each_other(few_bins):
         assert abs(float(witness) - (4.0 if fewer == 0 else 0.7)) < 0.05
 
 
+@pytest.mark.long
 def test_ties_of_exact_data():
     # Lattices have few lengths: ends meet exactly, by the hundred.
     rng = np.random.default_rng(1)
@@ -162,6 +166,7 @@ def test_nobody_votes(few_bins):
     assert not by_histogram(values, bounds, np.zeros(len(values), bool), 1.0, (0.0, np.inf))[0]
 
 
+@pytest.mark.long
 def test_a_batch_equals_a_loop(few_bins):
     drawn = [draw(seed) for seed in range(3)]
     values, bounds = (np.stack(x) for x in zip(*drawn, strict=True))

@@ -90,11 +90,13 @@ def test_every_module_has_its_place():
     assert sorted(modules()) == sorted(ORDER)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ORDER)
 def test_imports_point_back(name):
     assert not {other for other in imported(modules()[name]) if ORDER.index(other) >= ORDER.index(name)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ORDER)
 def test_files_and_functions_are_short(name):
     text = modules()[name].read_text()
@@ -112,6 +114,7 @@ NO_VERB = {"A", "An", "The", "All", "Both", "Each", "Every", "How", "One", "That
 NO_VERB |= {"Where", "Whether", "Which"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ORDER)
 def test_docstrings_of_functions_begin_with_a_verb(name):
     """In a tooltip a docstring stands alone: it says what the function does, and not what something is."""
@@ -135,6 +138,7 @@ def test_a_plain_import_loads_nothing_else():
     assert not {"jax", "numpy", "numba", "matplotlib", "networkx", "tqdm", "plotly", "optax"} & set(loaded)
 
 
+@pytest.mark.long
 def test_the_doors_load_what_they_need_and_no_more():
     code = (
         "import sys, json, teaser_jax as tj; tj.register; tj.solve_batch; print(json.dumps([*sys.modules]))"
@@ -143,6 +147,7 @@ def test_the_doors_load_what_they_need_and_no_more():
     assert not {"numba", "llvmlite", "matplotlib", "networkx", "plotly", "optax"} & set(loaded)
 
 
+@pytest.mark.long
 def test_the_front_page_is_whole():
     """Every name loads, is listed, and stays itself when the module that it lives in is imported."""
     code = """
@@ -159,6 +164,7 @@ assert not hasattr(tj, "no_such_name")
     in_a_fresh_python(code)
 
 
+@pytest.mark.long
 def test_a_plain_import_touches_no_configuration():
     in_a_fresh_python(
         "import jax; before = dict(jax.config.values); import teaser_jax; teaser_jax.register; "

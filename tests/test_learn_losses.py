@@ -101,6 +101,7 @@ def test_matching_loss_by_hand(x64):
     assert found == pytest.approx(0.5 * (rows + columns))
 
 
+@pytest.mark.long
 def test_nothing_to_learn_from_is_zero_with_gradient_zero():
     truth, nothing = pose(6), jnp.zeros(5, bool)
     src, a = jnp.zeros((5, 3)), jnp.ones((5, 4))

@@ -43,6 +43,7 @@ def test_equal_descriptors_find_each_other():
     np.testing.assert_allclose(found.confidence, 1, atol=1e-3)
 
 
+@pytest.mark.long
 def test_masked_points_match_nothing_and_change_nothing(x64):
     a, b = descriptors(2, 6, 8)
     spoiled = np.vstack([b, 100 * b[:3]])

@@ -35,6 +35,7 @@ def test_translation_and_scale_errors_are_distances():
     assert metrics.scale_error(pose(scale=0.5), pose(scale=2.0)) == pytest.approx(1.5)
 
 
+@pytest.mark.long
 def test_batches_and_jax_arrays_keep_their_kind():
     two = tj.Pose(jnp.stack([jnp.eye(3)] * 2), jnp.ones((2, 3)), jnp.ones(2))
     for error in (metrics.rotation_error, metrics.translation_error, metrics.scale_error):

@@ -70,6 +70,7 @@ def test_a_problem_arrives_as_it_was(scale, pairs, x64):
     np.testing.assert_array_equal(sent.mask, expected.mask)
 
 
+@pytest.mark.long
 def test_a_leaf_that_stands_in_a_record_twice_travels_once(x64):
     """The inliers are a field of the solution and of its selection."""
     drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)

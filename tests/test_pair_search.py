@@ -41,6 +41,7 @@ def test_it_is_never_worse_than_gnc_or_the_truth_at_high_rates(k, wrong):
         assert best.cost <= min(gnc.cost, rotation_cost(src, dst, truth)) + 1e-9
 
 
+@pytest.mark.long
 def test_the_candidate_of_the_frame_is_kept_where_it_is_best(x64):
     src, dst, truth = draw_vectors(1, 20, 0.3)
     best = np.asarray(found_by(framed(src, dst)))
@@ -62,6 +63,7 @@ def test_hypotheses_carry_their_pair(x64):
     assert found.costs[0] < 1e-9
 
 
+@pytest.mark.long
 def test_masked_and_many_measurements(x64, monkeypatch):
     src, dst, truth = draw_vectors(2, 30, 0.6)
     m = framed(src, dst)

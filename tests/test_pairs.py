@@ -96,6 +96,7 @@ def test_lengths_and_roots_are_flat_at_zero():
     np.testing.assert_allclose(norm(np.array([3.0, 0, 4]))[1], [0.6, 0, 0.8])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", SIZES)
 def test_fold_meets_each_ordered_pair_of_usable_matches_once(n):
     rng = np.random.default_rng(n)
@@ -130,6 +131,7 @@ def test_fold_hands_out_the_tims_and_bounds_of_the_dense_graph(n):
     np.testing.assert_allclose(found[6], (beta[:, None] + beta[None]) * off)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [5, 33])
 def test_gradient_through_the_fold_is_the_dense_one(n):
     rng = np.random.default_rng(n)

@@ -24,6 +24,7 @@ def quick(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 def test_the_report_has_a_row_for_every_figure_table_and_competitor(quick, tmp_path):
     path = write_report(quick, tmp_path / "PAPER.md")
     text = path.read_text()
@@ -43,6 +44,7 @@ def test_the_report_has_a_row_for_every_figure_table_and_competitor(quick, tmp_p
         write_report(tmp_path, tmp_path / "none.md")
 
 
+@pytest.mark.long
 def test_the_report_tells_of_other_models_in_folders_of_their_own(quick, tmp_path):
     folder = shutil.copytree(quick, tmp_path / "studies")
     cloud = Model("cloud", np.random.default_rng(0).standard_normal((400, 3)))
@@ -55,6 +57,7 @@ def test_the_report_tells_of_other_models_in_folders_of_their_own(quick, tmp_pat
     assert "### cloud" not in write_report(quick, tmp_path / "alone.md").read_text()
 
 
+@pytest.mark.long
 def test_claims_are_tested_and_not_believed(quick):
     results = read_results(quick / "known-scale")
     assert robust_to("teaser_jax", 0.9)(results).holds is True
@@ -68,6 +71,7 @@ def test_claims_are_tested_and_not_believed(quick):
     assert breaks_at("teaser_jax", 0.9)(results).holds is True
 
 
+@pytest.mark.long
 def test_the_command_writes_the_report_or_says_in_one_line_why_not(quick, tmp_path, capsys):
     path = tmp_path / "PAPER.md"
     assert main([str(quick), "-o", str(path)]) == 0

@@ -13,6 +13,7 @@ from teaser_jax.studies.methods import of_peer
 from teaser_jax.studies.peers import Peer, Question, find_peers
 
 
+@pytest.mark.long
 def test_a_peer_is_timed_warm_and_without_what_we_make_of_problems_and_answers():
     calls = []
 

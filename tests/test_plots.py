@@ -79,6 +79,7 @@ def test_hardly_any_finite_rows(small, solved, rows):
     drawn(before.figure)
 
 
+@pytest.mark.long
 def test_every_stage(small, solved):
     selection = solved.solution.selection
     edges = np.array(small.inliers[:, None] & small.inliers & ~np.eye(32, dtype=bool))
@@ -97,6 +98,7 @@ def test_every_stage(small, solved):
         drawn(figure)
 
 
+@pytest.mark.long
 def test_stages_with_nothing_to_show():
     none = np.zeros(0)
     figures = (
@@ -129,6 +131,7 @@ def test_the_cost_and_its_bound(solved):
     drawn(figure)
 
 
+@pytest.mark.long
 def test_certified_answers_and_error_bounds():
     figure = plots.plot_certified({"right": (3, 4), "wrong": (0, 0)})
     assert [t.get_text() for t in figure.axes[0].texts] == ["3 of 4", "0 of 0"]
@@ -138,6 +141,7 @@ def test_certified_answers_and_error_bounds():
     drawn(plots.plot_bounds({}))
 
 
+@pytest.mark.long
 def test_slopes_errors_and_training_are_drawn():
     rng = np.random.default_rng(0)
     residuals = rng.uniform(0, 3, 40)

@@ -302,6 +302,7 @@ def test_problems_can_be_made_under_vmap():
 # --- stacking -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_stacking_pads_and_masks():
     sizes = (5, 8, 3)
     problems = [problem_of(random_matches(k, n), confidence=np.arange(n) + 1.0) for k, n in enumerate(sizes)]

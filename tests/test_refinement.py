@@ -101,6 +101,7 @@ def test_degenerate_input_gives_a_finite_fit(known):
     assert fit(point, matches.dst, nothing + 1, scale).scale == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("known", [True, False])
 def test_derivatives_agree_with_central_differences(known):
     matches = random_matches(4, N, wrong=0.2, scale=1.4)
@@ -137,6 +138,7 @@ def cost_of(inliers, matches, bounds, mask, scale) -> float:
     return np.sum(np.minimum(joint_residuals(pose, matches.src, matches.dst, bounds) ** 2, 1)[mask])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [np.float64(1.3), None], ids=["known", "unknown"])
 def test_the_descent_never_rises_and_ends_at_a_fixed_point(scale):
     moved = 0

@@ -47,6 +47,7 @@ def trims_of(src, dst, bounds, pairs):
     return b / a, (bounds[i] + bounds[j]) / a
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [11, 12])
 @pytest.mark.parametrize("wrong", [0.0, 0.5])
 def test_every_unordered_pair_votes_once(n, wrong):
@@ -151,6 +152,7 @@ def test_larger_clouds_and_bounds_scale_the_answer():
 # --- the smooth read-out --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("given", [False, True])
 def test_read_out_is_the_weighted_mean_of_the_chosen(given):
     n = 12
@@ -170,6 +172,7 @@ def test_read_out_is_the_weighted_mean_of_the_chosen(given):
     assert float(read) == pytest.approx(np.sum(weight * values) / np.sum(weight), rel=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("given", [False, True])
 def test_gradient_of_the_read_out_is_the_central_difference(given):
     n = 12
@@ -186,6 +189,7 @@ def test_gradient_of_the_read_out_is_the_central_difference(given):
     assert slope == pytest.approx(float(step(1) - step(-1)) / 2e-6, abs=1e-7)
 
 
+@pytest.mark.long
 def test_no_choice_reads_as_zero_with_finite_gradient():
     src, dst, bounds, _ = map(jnp.asarray, inputs(random_matches(8, 12)))
     nothing = jnp.zeros((12, 1), jnp.uint32)
@@ -209,6 +213,7 @@ def test_float32_points_vote_in_float64():
     assert float(narrow) == pytest.approx(float(wide), rel=1e-7)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("jitter", [0.0, 1e-3])
 @pytest.mark.parametrize("hub", [20, 60])
 def test_many_to_one_matches_do_not_vote_the_scale_to_zero(jitter, hub):

@@ -10,6 +10,7 @@ from teaser_jax import synthetic
 from teaser_jax.synthetic.solids import _PARTS
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", synthetic.KINDS)
 def test_a_part_has_the_area_it_says_and_its_points_lie_on_its_skin(kind):
     part = _PARTS[kind](np.random.default_rng(1))

@@ -35,6 +35,7 @@ def test_the_projection_keeps_what_is_positive(matrix, x64):
     assert_allclose(np.linalg.norm(projected - matrix), 1)  # no semidefinite matrix is nearer
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", [0, 1, 3])
 def test_padding_is_no_direction_wherever_it_stands(place, matrix, x64):
     index = np.delete(np.arange(16), np.arange(4 * place, 4 * place + 4))

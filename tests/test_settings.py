@@ -54,6 +54,7 @@ def test_jax_tells_every_method_from_every_other(field, names):
     assert len(set(structures)) == len(names)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("door", ["jit", "batch"])  # without jit: see test_solve.py
 def test_a_program_of_one_method_is_not_run_for_another(door):
     problem = problem_of(random_matches(0))

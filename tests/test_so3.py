@@ -115,6 +115,7 @@ def test_singular_frames_rebuild_the_matrix(kind, x64):
     assert np.all(values[:, 1] >= np.abs(values[:, 2]) - slack)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["random", "equal", "two equal", "rank two", "reflected"])
 def test_forward_reverse_and_central_differences_agree(kind, x64):
     matrix = KINDS[kind]
@@ -159,6 +160,7 @@ def special_rotations() -> np.ndarray:
     return np.concatenate([Rotation.from_rotvec(angle * axes).as_matrix() for angle in angles])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("xp", [np, jnp])
 def test_quaternions_are_scipys_and_return(xp, x64):
     rotations = special_rotations()

@@ -60,6 +60,7 @@ def assert_same(a: tj.Solution, b: tj.Solution, *, rows: int | None = None, tole
 # --- one answer however it is run -----------------------------------------------------------------
 
 
+@pytest.mark.long
 @both_scales
 def test_right_matches_are_found(scale, x64):
     for seed in range(10):
@@ -333,6 +334,7 @@ def test_a_float32_problem_stays_float32_with_x64_on(x64):
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wide", [False, True], ids=["x64 off", "x64 on"])
 @pytest.mark.parametrize(
     ("scale", "variant"), [(1.3, "default"), (None, "default"), (None, "complete cascade")]

@@ -13,6 +13,7 @@ from teaser_jax.certify.certificate import CertificateStatus
 from teaser_jax.so3 import rotation_angle
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["gnc", "global"])
 def test_the_rotation_the_sets_the_cost_and_the_proof(method):
     src, dst, truth = draw_vectors(0, 30, 0.4)
@@ -40,6 +41,7 @@ def test_hard_rates_are_solved_and_most_are_certified(k, runs, wrong):
     assert certified >= 0.8 * runs  # of 30 runs with 40, 90 % wrong: 25
 
 
+@pytest.mark.long
 def test_rows_of_the_mask_in_the_order_of_the_user():
     src, dst, _ = draw_vectors(1, 20, 0.2)
     order = np.random.default_rng(0).permutation(25)

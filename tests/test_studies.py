@@ -99,6 +99,7 @@ def test_two_processes_write_the_rows_of_one(quick, tmp_path):
         assert without_times(shared) == without_times(row for row in of_one if row["method"] == method)
 
 
+@pytest.mark.long
 def test_a_row_cut_in_the_middle_is_computed_again(tmp_path):
     run_study("translation", tmp_path, runs=2, quick=True, methods=TLS)
     table = tmp_path / "translation" / "table.csv"
@@ -170,6 +171,7 @@ def test_figures_without_a_place_are_said(quick, tmp_path):
         run_study("known-scale", folder, quick=True, runs=2, methods=["teaser_jax"])
 
 
+@pytest.mark.long
 def test_runs_and_methods_are_added_to_a_table(tmp_path):
     run_study("translation", tmp_path, runs=1, quick=True, methods=TLS)
     first = read_table(tmp_path / "translation" / "table.csv")
@@ -179,6 +181,7 @@ def test_runs_and_methods_are_added_to_a_table(tmp_path):
     assert len(after) == len(keys(after)) == 4 * 3 * 2
 
 
+@pytest.mark.long
 def test_another_model_or_seed_needs_another_folder(tmp_path):
     run_study("translation", tmp_path, runs=1, quick=True, methods=TLS)
     with pytest.raises(FileError, match="seed 0, and 1 is asked for: name another folder"):
@@ -385,6 +388,7 @@ def test_what_makes_no_sense_is_said_before_anything_is_written(tmp_path, known,
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.long
 def test_the_command(tmp_path, capsys):
     from teaser_jax.cli import main
 

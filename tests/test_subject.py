@@ -36,6 +36,7 @@ def test_a_chain_is_closed(solved):
     assert_allclose(subject.noise_bound[subject.mask], 2 * solved.problem.noise_bound[0])
 
 
+@pytest.mark.long
 def test_the_complete_graph_has_all_pairs_of_the_clique(solved):
     members = np.flatnonzero(solved.solution.selection.clique)
     src, _ = existing(subject_on_host(solved.problem, solved.solution, "complete"))
@@ -44,6 +45,7 @@ def test_the_complete_graph_has_all_pairs_of_the_clique(solved):
     assert_allclose(src, points[j] - points[i], atol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("about", ["pose", "chain", "complete"])
 def test_under_jit_they_are_the_same_and_in_front(about, solved, x64):
     outside = existing(subject_on_host(solved.problem, solved.solution, about))

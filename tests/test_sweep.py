@@ -99,6 +99,7 @@ def agreeing(x: float, b: Ballot, slack: float) -> np.ndarray:
     return use & (np.abs(x - b.values) <= np.sqrt(b.cbar2) * b.bounds * (1 + slack))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_tls_is_the_global_optimum(kind):
     ballots = random_ballots(KINDS.index(kind), BATCH, kind)
@@ -121,6 +122,7 @@ def test_tls_is_the_global_optimum(kind):
         assert won.estimate == pytest.approx(mean_of(won.members, b.values, b.bounds), rel=1e-12, abs=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_consensus_is_the_largest_set(kind):
     ballots = random_ballots(KINDS.index(kind), BATCH, kind)
@@ -175,6 +177,7 @@ def test_no_measurement_and_no_voter_answer_zero(criterion):
         assert not won.members.any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("criterion", ["tls", "consensus"])
 @pytest.mark.parametrize("k", [1, 2, 5])
 def test_padding_changes_nothing(k, criterion):

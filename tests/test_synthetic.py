@@ -73,6 +73,7 @@ def test_a_given_truth_is_kept():
     np.testing.assert_allclose(problem.dst, 2 * problem.src, atol=problem.noise_bound)
 
 
+@pytest.mark.long
 def test_no_rotation_or_reflection_maps_the_teapot_onto_itself():
     pot = synthetic.teapot(20_000)
     pot = pot[:4000] - pot.mean(axis=0)

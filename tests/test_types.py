@@ -30,6 +30,7 @@ both_kinds = pytest.mark.parametrize("kind", ["numpy", "jax"])
 batches = pytest.mark.parametrize("batch", BATCHES, ids=str)
 
 
+@pytest.mark.long
 @both_kinds
 @batches
 def test_composition_applies_the_right_pose_first(kind, batch, x64):
@@ -84,6 +85,7 @@ def test_numpy_poses_stay_float64_without_x64():
     np.testing.assert_allclose((pose @ pose.inverse()).matrix, np.eye(4), atol=1e-15)
 
 
+@pytest.mark.long
 def test_jax_poses_stay_on_the_device():
     pose = as_kind(poses(8), "jax")
     for result in (pose.matrix, pose.quat, pose.apply(np.ones((2, 3))), pose.inverse().translation):

@@ -135,6 +135,7 @@ def test_no_noise_is_exact(x64):
     assert np.all(np.isinf(np.diag(found.information)))
 
 
+@pytest.mark.long
 def test_bad_arguments_are_told_apart(unchecked):
     matches = random_matches(8, N)
     result = tj.register(matches.src, matches.dst, noise_bound=0.05)
@@ -147,6 +148,7 @@ def test_bad_arguments_are_told_apart(unchecked):
         pose_difference(result.pose, result.pose, convention="left")
 
 
+@pytest.mark.long
 def test_the_difference_of_equal_poses_is_zero_and_has_a_finite_gradient(x64):
     pose = jax.tree.map(jnp.asarray, random_matches(0).truth)
     np.testing.assert_allclose(pose_difference(pose, pose), 0, atol=1e-15)
@@ -162,6 +164,7 @@ def test_every_turn_is_seen_in_full(angle, x64):
     assert np.linalg.norm(found[:3]) == pytest.approx(angle, abs=1e-12)
 
 
+@pytest.mark.long
 def test_a_stack_and_a_solution_of_another_problem_are_refused():
     matches, others = random_matches(8, N), random_matches(8, N + 1)
     result, other = (tj.register(m.src, m.dst, noise_bound=0.05) for m in (matches, others))

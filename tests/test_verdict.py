@@ -29,11 +29,13 @@ def cloud(n=60, seed=1):
     return np.random.default_rng(seed).uniform(size=(n, 3))
 
 
+@pytest.mark.long
 def test_right_matches_are_ok():
     src = cloud()
     assert status(src, moved(src)) == tj.Status.OK
 
 
+@pytest.mark.long
 def test_three_clean_matches_among_few_are_not_beyond_chance():
     # Any three matches that agree on their distances make a perfect pose: that alone is no evidence.
     src = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0.5]])
