@@ -81,20 +81,35 @@ def make_problem(
     return jax.tree.map(jnp.asarray, read)
 
 
-def host_problem(src: Any, dst: Any, **known: Any) -> Problem:
+def host_problem(
+    src: Any,
+    dst: Any,
+    *,
+    noise_bound: Any,
+    scale: Any = 1.0,
+    cbar2: Any = 1.0,
+    mask: Any = None,
+    confidence: Any = None,
+    pairs: Any = None,
+) -> Problem:
     """Make a problem in float64 numpy, from anything that can be read on the host: for ``solve_batch``.
 
     Args:
         src, dst: (n, 3) matched points, row i with row i [length].
-        known: The other arguments of ``make_problem``: ``noise_bound`` [length], ``scale``, ``cbar2``,
-            ``mask``, ``confidence``, ``pairs``.
+        noise_bound, scale, cbar2, mask, confidence, pairs: As for ``make_problem``.
+
+    Returns:
+        A pytree of numpy arrays.
 
     Raises:
         ValueError: As ``make_problem``; inside jit, where ``make_problem`` is the function to use.
     """
-    if is_traced(src, dst, known):
+    if is_traced(src, dst, noise_bound, scale, cbar2, mask, confidence, pairs):
         raise ValueError("host_problem reads numbers on the host: inside jit use make_problem.")
-    return read_problem(src, dst, dtype=np.dtype(np.float64), **known)
+    return read_problem(
+        src, dst, dtype=np.dtype(np.float64), noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
+        confidence=confidence, pairs=pairs,
+    )  # fmt: skip
 
 
 def read_problem(

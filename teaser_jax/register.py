@@ -62,7 +62,7 @@ class Registration:
     def certificate(self) -> Certificate:
         """What is proved of the rotation, given the clique and the inliers; computed when first asked for.
 
-        ``certify(result.problem, result.solution, ...)`` has more choices. It never turns ``ok`` true.
+        ``certify(result, ...)`` has more choices. It never turns ``ok`` true.
         """
         return certify_pose(self.problem, self.solution)
 

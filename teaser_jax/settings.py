@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias, get_args
 
 import jax
+import numpy as np
 
 from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.numbers import check_concrete
@@ -61,7 +62,8 @@ class Settings:
             False, that is None, gives the paper's plain cascade.
 
     Raises:
-        ValueError: If a choice is unknown or a number out of range.
+        ValueError: If a name is unknown or a number out of range. What is no record at all is refused by the
+            function that is called with the settings, because JAX rebuilds them from placeholders.
     """
 
     scale_search: ScaleVote | Any = ScaleVote()
@@ -78,7 +80,7 @@ class Settings:
             object.__setattr__(self, name, as_record(f"Settings.{name}", getattr(self, name), known))
         if isinstance(self.refine, str):
             one_of("Settings.refine", self.refine, (True, False))
-        if isinstance(self.refine, bool):
+        if isinstance(self.refine, bool | np.bool_):
             object.__setattr__(self, "refine", Refinement() if self.refine else None)
 
     def __repr__(self) -> str:
@@ -102,9 +104,13 @@ def as_record(name: str, choice: Any, known: dict[str, Any]) -> Any:
 def check_record(name: str, record: Any, known: dict[str, Any]) -> None:
     """Check that a choice is one of the known records, and that its numbers are known. Raises ValueError."""
     if not isinstance(record, tuple(known.values())):
-        one_of(name, record, known)
+        usual = ", ".join(f"{name!r} or {method.__name__}(...)" for name, method in known.items())
+        raise ValueError(f"{name} is {record!r}: expected {usual}.")
     check_concrete(record)
-    check_concrete(getattr(record, "gnc", record))
+    first = getattr(record, "gnc", Gnc())
+    if not isinstance(first, Gnc):
+        raise ValueError(f"{type(record).__name__}.gnc is {first!r}: expected a Gnc(...).")
+    check_concrete(first)
 
 
 def check_settings(settings: Any) -> None:

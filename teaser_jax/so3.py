@@ -180,7 +180,7 @@ def nearest_rotation(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     zero. Differentiating an SVD instead gives NaN at equal singular values and finite but wrong
     numbers at two equal ones.
 
-    References: Yang, Shi, Carlone, T-RO 2020, eq. (12) without truncation; Horn 1987.
+    References: Yang, Shi, Carlone, T-RO 2021, eq. (12) without truncation; Horn 1987.
     """
     left, right = _leading_axes(matrix)
     third = times(_cross(left[0], left[1])[:, None], _cross(right[0], right[1])[None])

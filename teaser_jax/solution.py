@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 
 from teaser_jax.ground.arrays import AnyArray, Placeholder
 from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem
 
 
 class Status(enum.IntEnum):
@@ -112,3 +114,30 @@ class Solution:
             f"Solution(status={Status(int(self.status)).name}, {int(np.sum(self.inliers))} of "
             f"{np.shape(self.inliers)[-1]} matches, pose={self.pose!r})"
         )
+
+
+def problem_and_solution(problem: Any, solution: Any, caller: str) -> tuple[Problem, Solution]:
+    """Read a problem and its solution; the answer of ``register``, which holds both, may stand for either.
+
+    Args:
+        problem: A ``Problem``, or what has one.
+        solution: Its ``Solution``, or what has one; None: what the first argument has.
+        caller: Who asks, for the error.
+
+    Raises:
+        ValueError: If one of the two is something else, or they do not belong together.
+    """
+    solution = getattr(problem if solution is None else solution, "solution", solution)
+    problem = getattr(problem, "problem", problem)
+    for name, value, kind in (("problem", problem, Problem), ("solution", solution, Solution)):
+        if not isinstance(value, kind):
+            raise ValueError(
+                f"{caller} received {type(value).__name__} for a {name}: give the answer of register alone, "
+                "or a problem and its solution."
+            )
+    if np.shape(solution.inliers) != np.shape(problem.mask):
+        raise ValueError(
+            f"the problem has rows of shape {np.shape(problem.mask)} and the solution inliers of shape "
+            f"{np.shape(solution.inliers)}: expected a problem and its own solution."
+        )
+    return problem, solution

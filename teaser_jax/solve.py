@@ -63,7 +63,7 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
     everywhere; the sets themselves carry none (``soft_solve`` differentiates through them, too). Zero
     where the rotation is ambiguous, and then the status is not OK.
 
-    References: Yang, Shi, Carlone, T-RO 2020, Algorithm 1 with MCIS (section VI-D) and GNC (section X).
+    References: Yang, Shi, Carlone, T-RO 2021, Algorithm 1 with MCIS (section VI-D) and GNC (section X).
     """
     cleaned, excluded = _at_the_door(problem, settings)
     frozen = lax.stop_gradient(cleaned)

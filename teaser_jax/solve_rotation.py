@@ -101,7 +101,7 @@ def solve_rotation(
 
     Gradients: none, inputs are stopped. ``refit`` has the derivative on chosen measurements.
 
-    References: Yang, Shi, Carlone, T-RO 2020, section VIII, (12), (19), (23), Theorem 13; GNC: Yang,
+    References: Yang, Shi, Carlone, T-RO 2021, section VIII, (12), (19), (23), Theorem 13; GNC: Yang,
     Antonante, Tzoumas, Carlone, RA-L 2020.
     """
     chosen: RotationMethod = as_record("method", method, ROTATIONS)

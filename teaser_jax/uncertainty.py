@@ -21,7 +21,7 @@ from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced, safe_norm
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import refit
-from teaser_jax.solution import Solution
+from teaser_jax.solution import Solution, problem_and_solution
 from teaser_jax.stages.refinement import squared_residuals
 
 Convention = Literal["right", "ros", "gtsam", "g2o"]
@@ -46,7 +46,11 @@ class Uncertainty:
 
 
 def covariance(
-    problem: Problem, solution: Solution, sigma: Any = None, *, convention: Convention = "right"
+    problem: Problem | Any,
+    solution: Solution | Any = None,
+    sigma: Any = None,
+    *,
+    convention: Convention = "right",
 ) -> Uncertainty:
     """Compute the covariance of the pose, to first order in the noise, the chosen matches being right.
 
@@ -70,7 +74,7 @@ def covariance(
     coordinate follows, log(s' / s); the first six rows and columns are the pose's own covariance.
 
     Args:
-        problem, solution: A pair that ``solve`` or ``register`` made.
+        problem, solution: The answer of ``register`` alone, or a problem and what ``solve`` made of it.
         sigma: Standard deviation of the error of each coordinate of a match [length], one number or (n,).
             None: proportional to ``noise_bound``, the factor being estimated from the inliers' residuals.
         convention: Coordinates, see above.
@@ -85,15 +89,11 @@ def covariance(
     Gradients: exact, through the second derivative of the fit.
     """
     _check_convention(convention)
-    if not isinstance(solution, Solution):
+    problem, solution = problem_and_solution(problem, solution, "covariance")
+    if problem.src.ndim != 2:
         raise ValueError(
-            f"covariance takes the Solution of solve, received {type(solution).__name__}: of a Registration "
-            "or a SoftSolution give its .solution."
-        )
-    if problem.src.ndim != 2 or np.shape(solution.inliers) != problem.src.shape[:1]:
-        raise ValueError(
-            f"covariance takes one problem and its solution, received src of shape {problem.src.shape} and "
-            f"inliers of shape {np.shape(solution.inliers)}: use jax.vmap for a stack."
+            f"covariance takes one problem and its solution, received src of shape {problem.src.shape}: use "
+            "jax.vmap for a stack."
         )
     if sigma is not None:
         sigma = _checked(sigma, problem)

@@ -155,3 +155,26 @@ def test_after_warmup_certificates_compile_nothing():
     jax.jit(lambda x: x + 1.2345)(1.0)
     assert compiled  # whatever is new is seen
     listening.clear()
+
+
+def test_an_answer_of_register_stands_for_problem_and_solution(small, solved):
+    for ask in (tj.certify, tj.error_bounds, tj.covariance):
+        alone, both = ask(solved), ask(solved.problem, solved.solution)
+        assert repr(alone) == repr(both) == repr(ask(solved.problem, solved))
+
+
+@pytest.mark.parametrize("ask", [tj.certify, tj.error_bounds, tj.covariance])
+def test_what_is_no_problem_and_its_solution_is_named(ask, solved, unchecked):
+    fewer = tj.host_problem(solved.problem.src[:9], solved.problem.dst[:9], noise_bound=0.1)
+    for pair, said in (
+        (
+            (solved.solution, solved.problem),
+            f"{ask.__name__} received Solution for a problem: give the",
+        ),
+        ((solved.problem,), "received NoneType for a solution"),
+        ((solved.problem, solved.pose), "received Pose for a solution"),
+        ((solved.problem.src, solved.solution), "received ndarray for a problem"),
+        ((fewer, solved.solution), r"the problem has rows of shape \(9,\) and the solution"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            ask(*pair)

@@ -299,6 +299,13 @@ def test_demo_without_matplotlib_leaves_the_picture_out(tmp_path, small, capsys,
     assert "teaser-jax[viz]" in capsys.readouterr().err
 
 
+def test_the_choices_are_those_of_the_settings():
+    from teaser_jax.cli import arguments
+
+    assert tuple(tj.settings.CLIQUES) == arguments.CLIQUES
+    assert tuple(tj.settings.ROTATIONS) == arguments.ROTATIONS
+
+
 def test_version_and_help(capsys):
     for arguments, text in ((["--version"], tj.__version__), (["register", "--help"], "--noise-bound")):
         with pytest.raises(SystemExit, match="0"):

@@ -95,6 +95,7 @@ def test_new_numbers_compile_nothing_and_new_caps_do():
         (lambda: tj.Settings(rotation="svd"), "Settings.rotation is 'svd': expected one of 'gnc', 'global'"),
         (lambda: tj.Settings(vote="all"), "Settings.vote is 'all': expected one of 'tls', 'consensus'"),
         (lambda: tj.Settings(refine="no"), "Settings.refine is 'no': expected one of True, False"),
+        (lambda: PairSearch(gnc="svd"), "PairSearch.gnc is 'svd': expected one of 'gnc'"),
         (lambda: Gnc(factor=1), "Gnc.factor is 1: expected a number above 1"),
         (lambda: Gnc(factor=True), "Gnc.factor is True: expected a number above 1"),
         (lambda: Gnc(tolerance=-1e-3), "Gnc.tolerance is -0.001: expected 0 or more"),
@@ -118,6 +119,7 @@ def test_what_makes_no_sense_is_refused_at_once(made, said, unchecked):
         tj.Settings(refine=3), tj.Settings(rotation=Gnc(factor=None)),
         tj.Settings(scale_search=ScaleVote((0.5, None))),
         tj.Settings(rotation=PairSearch(gnc=Gnc(factor=jnp.float32(0.5)))), "greedy", None,
+        tj.Settings(clique=GreedyClique), tj.Settings(scale_search=(1, 2)),
     ],
     ids=str,
 )  # fmt: skip

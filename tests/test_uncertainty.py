@@ -168,7 +168,7 @@ def test_every_turn_is_seen_in_full(angle, x64):
 def test_a_stack_and_a_solution_of_another_problem_are_refused():
     matches, others = random_matches(8, N), random_matches(8, N + 1)
     result, other = (tj.register(m.src, m.dst, noise_bound=0.05) for m in (matches, others))
-    with pytest.raises(ValueError, match="one problem and its solution"):
+    with pytest.raises(ValueError, match="a problem and its own solution"):
         tj.covariance(result.problem, other.solution)
 
 
@@ -198,8 +198,6 @@ def test_other_records_are_told_apart(unchecked):
     drawn = tj.synthetic.random_problem(0, n=32, outlier_rate=0.3)
     result = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
     problem = tj.host_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
-    with pytest.raises(ValueError, match="give its .solution"):
-        tj.covariance(problem, result)
     with pytest.raises(ValueError, match="convention=... has its name"):
         tj.covariance(problem, result.solution, "gtsam")
     with pytest.raises(ValueError, match="give solution.selection"):

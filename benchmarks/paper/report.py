@@ -55,7 +55,7 @@ def _report(found: dict[str, Results], models: Models, folder: Path, here: Path)
     yield "# The paper, reproduced"
     yield ""
     yield (
-        "*TEASER: Fast and Certifiable Point Cloud Registration* (Yang, Shi, Carlone, T-RO 2020), section "
+        "*TEASER: Fast and Certifiable Point Cloud Registration* (Yang, Shi, Carlone, T-RO 2021), section "
         "XI, by its protocol. `teaser-jax study all` fills the tables and `python -m benchmarks.paper` "
         "writes this page from them, on any machine."
     )

@@ -72,7 +72,7 @@ def dual_of(m: Measurements, matrix: Float[Array, "n4 n4"]) -> Dual:
 def reference_guess(m: Measurements) -> Dual:
     """Make the published initial guess, which has no coupling between measurements.
 
-    References: Yang, Shi, Carlone, T-RO 2020, Algorithm 3 and its supplement.
+    References: Yang, Shi, Carlone, T-RO 2021, Algorithm 3 and its supplement.
     """
     plus, minus = cost_blocks(m)
     r2 = jnp.where(m.inliers, jnp.sum(m.residuals**2, axis=1), 0)

@@ -8,6 +8,7 @@ inliers; they come with the contracts that they are part of. And a bound over th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +24,7 @@ from teaser_jax.ground.checks import whole_number
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import cascade_pose
-from teaser_jax.solution import Selection, Solution
+from teaser_jax.solution import Selection, Solution, problem_and_solution
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,8 @@ class ErrorBounds:
 
 
 def error_bounds(
-    problem: Problem,
-    solution: Solution,
+    problem: Problem | Any,
+    solution: Solution | Any = None,
     *,
     wrong: int | np.integer = 0,
     certificate: Certificate | None = None,
@@ -66,7 +67,8 @@ def error_bounds(
     """Bound the error of a pose, and say what each bound rests on.
 
     Args:
-        problem, solution: The pair that ``solve`` or ``register`` made, one problem, concrete values.
+        problem, solution: The answer of ``register`` alone, or a problem and what ``solve`` made of it; one
+            problem, concrete values.
         wrong: How many of the inliers may be wrong, for the bound over the whole set.
         certificate: Of the rotation subproblem, as ``certify(..., about="chain")`` gives it; None: made here.
 
@@ -75,15 +77,22 @@ def error_bounds(
         exceeds what is always true.
 
     Raises:
-        ValueError: Inside jit, for a stack of solutions, or for a negative ``wrong``.
+        ValueError: If the two do not belong together, inside jit, for a stack of solutions, or for a
+            negative ``wrong``.
 
     Gradients: none; numpy on the host.
 
-    References: Yang, Shi, Carlone, T-RO 2020, Theorems 15 - 17, (26) - (28).
+    References: Yang, Shi, Carlone, T-RO 2021, Theorems 15 - 17, (26) - (28).
     """
+    problem, solution = problem_and_solution(problem, solution, "error_bounds")
     if is_traced(problem, solution) or np.ndim(solution.status) != 0:
         raise ValueError("error_bounds takes one problem and runs outside jit: give it the items one by one.")
     wrong = whole_number("wrong", wrong, 0, what="the number of inliers that may be wrong")
+    if not isinstance(certificate, Certificate | None):
+        raise ValueError(
+            f"certificate is of type {type(certificate).__name__}: expected what certify(..., about='chain') "
+            "gives."
+        )
     p, s = on_host((problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
     cascade = in_float64(lambda: jax.device_get(_cascade(p, s.selection)))

@@ -21,7 +21,7 @@ from teaser_jax.certify.traced import certify_traced
 from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
 from teaser_jax.ground.checks import one_of
 from teaser_jax.problem import Problem, clean
-from teaser_jax.solution import Solution
+from teaser_jax.solution import Solution, problem_and_solution
 
 MAX_TRACED = 128  # measurements under jit, where sizes are static
 
@@ -29,8 +29,8 @@ Records = TypeVar("Records")
 
 
 def certify(
-    problem: Problem,
-    solution: Solution,
+    problem: Problem | Any,
+    solution: Solution | Any = None,
     *,
     about: About = "pose",
     tolerance: Any = TOLERANCE,
@@ -44,8 +44,9 @@ def certify(
     says that the matches are right: where all are wrong, the best rotation is certified, too.
 
     Args:
-        problem, solution: The pair that ``solve`` or ``register`` made; outside jit also stacks of them,
-            where the closed form is tried on all at once and only what it leaves is iterated on.
+        problem, solution: The answer of ``register`` alone, or a problem and what ``solve`` made of it;
+            outside jit also stacks of them, where the closed form is tried on all at once and only what it
+            leaves is iterated on.
         about: ``"pose"``: clique and inliers about the inliers' centroids, bounds c beta_i, whose residuals
             are those of the registration; ``"chain"`` and ``"complete"``: the TIMs of the clique with bounds
             beta_i + beta_j, about the rotation of the plain cascade.
@@ -60,7 +61,7 @@ def certify(
         A ``Certificate``, whose ``inlier_gap`` and ``explained_gap`` come from the bound on the clique.
 
     Raises:
-        ValueError: If ``about`` is unknown, or under jit a stack is given.
+        ValueError: If ``about`` is unknown, the two do not belong together, or under jit a stack is given.
 
     Gradients: none, inputs are stopped.
 
@@ -68,6 +69,7 @@ def certify(
     """
     one_of("about", about, get_args(About))
     one_of("method", method, get_args(CertifyMethod))
+    problem, solution = problem_and_solution(problem, solution, "certify")
     traced = is_traced(problem, solution)
     if max_measurements is None:
         max_measurements = MAX_TRACED if traced else MAX_MEASUREMENTS

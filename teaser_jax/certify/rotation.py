@@ -67,7 +67,7 @@ def certify_rotation(
 
     Gradients: none, inputs are stopped.
 
-    References: Yang, Shi, Carlone, T-RO 2020, section VIII-C, problems (19) and (23), Algorithm 3.
+    References: Yang, Shi, Carlone, T-RO 2021, section VIII-C, problems (19) and (23), Algorithm 3.
     """
     one_of("method", method, get_args(CertifyMethod))
     *stack, k, _ = _checked_shape(src, dst, rotation)

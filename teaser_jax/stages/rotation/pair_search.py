@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.ground import bits
+from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.ground.numbers import named
 from teaser_jax.stages.rotation.gnc import Gnc
@@ -41,6 +42,11 @@ class PairSearch:
     name: str = named("global")
     gnc: Gnc = Gnc()
     needs_host: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.gnc, str):
+            one_of(f"{type(self).__name__}.gnc", self.gnc, (Gnc.name,))
+            object.__setattr__(self, "gnc", Gnc())
 
     def turn(self, m: Measurements) -> Float[Array, "3 3"]:
         """Find the turn from the frame of the measurements to the best rotation that the pairs lead to."""

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax import so3
+from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.numbers import named
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.pair_search import polish, search_pairs
@@ -43,6 +44,11 @@ class Relaxation:
     name: str = named("sdp")
     gnc: Gnc = Gnc()
     needs_host: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if isinstance(self.gnc, str):
+            one_of(f"{type(self).__name__}.gnc", self.gnc, (Gnc.name,))
+            object.__setattr__(self, "gnc", Gnc())
 
     def turn(self, m: Measurements) -> Float[Array, "3 3"]:
         """Find the turn to the best rotation that pairs and relaxation lead to; ValueError inside jit."""
@@ -151,7 +157,7 @@ def relax(cost_matrix: np.ndarray, *, accuracy: float = 1e-6, iterations: int = 
     Raises:
         ImportError: Without the extra ``sdp``.
 
-    References: Yang, Shi, Carlone, T-RO 2020, Proposition 12; O'Donoghue et al., JOTA 2016 (SCS).
+    References: Yang, Shi, Carlone, T-RO 2021, Proposition 12; O'Donoghue et al., JOTA 2016 (SCS).
     """
     try:
         import scs
