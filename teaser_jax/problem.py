@@ -161,6 +161,18 @@ def read_problem(
     )
 
 
+def check_precision(problem: Problem) -> None:
+    """Check that JAX can hold the numbers of a problem in numpy: it rounds them unless its x64 is on.
+
+    Raises:
+        ValueError: If the bound is lost in the rounding, as ``make_problem``.
+    """
+    held = jax.dtypes.canonicalize_dtype(problem.src.dtype)
+    if isinstance(problem.src, np.ndarray) and held != problem.src.dtype and not is_traced(problem):
+        p = problem
+        reading.check_values(p.src, p.dst, p.noise_bound, p.mask, p.confidence, held)
+
+
 def stack_problems(problems: Iterable[Problem]) -> Problem:
     """Stack problems of any sizes as one batch: padded to the largest, padding masked.
 

@@ -6,10 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
+from teaser_jax.ground.arrays import is_traced
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.solution import Selection
@@ -31,7 +33,7 @@ def refit(problem: Problem, selection: Selection) -> Pose:
         selection: Of that problem, as in ``solution.selection``: sets in the order of its rows.
 
     Returns:
-        The pose from the source to the target frame.
+        The pose from the source to the target frame; in numpy where the problem is.
 
     Raises:
         ValueError: If they do not belong together.
@@ -53,6 +55,14 @@ def refit(problem: Problem, selection: Selection) -> Pose:
         raise ValueError(
             "the selection was made with a known scale, and the problem has none: give its scale."
         )
+    if isinstance(problem.src, np.ndarray) and not is_traced(problem, selection):
+        with jax.enable_x64(True):  # a problem in float64 is not rounded, whatever JAX is set to
+            return jax.device_get(_compiled(problem, selection))
+    return _refit(problem, selection)
+
+
+def _refit(problem: Problem, selection: Selection) -> Pose:
+    """Compute the pose; problem and selection belong together."""
     cleaned, _ = clean(problem)
     selection = jax.tree.map(jnp.asarray, selection)
     return lax.cond(
@@ -60,6 +70,9 @@ def refit(problem: Problem, selection: Selection) -> Pose:
         lambda: joint_pose(cleaned, selection),
         lambda: cascade_pose(cleaned, selection),
     )
+
+
+_compiled = jax.jit(_refit)
 
 
 def check_problem(problem: Any) -> None:

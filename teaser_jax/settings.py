@@ -28,11 +28,11 @@ from teaser_jax.stages.refinement import Refinement
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.pair_search import PairSearch
 from teaser_jax.stages.rotation.relaxation import Relaxation
+from teaser_jax.stages.rotation.robust import RotationMethod
 from teaser_jax.stages.scale import ScaleVote
 from teaser_jax.stages.vote.sweep import Criterion
 
 TimGraph: TypeAlias = Literal["chain", "complete"]
-RotationMethod: TypeAlias = Gnc | PairSearch | Relaxation
 
 # What each choice may be, and the names that stand for the records with their defaults.
 SCALES = {method.name: method for method in (ScaleVote,)}

@@ -22,7 +22,7 @@ from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.pose import Pose
-from teaser_jax.problem import Problem, clean
+from teaser_jax.problem import Problem, check_precision, clean
 from teaser_jax.refit import check_problem
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Solution, Status
@@ -108,6 +108,7 @@ def soft_solve(
     References: Yang, Antonante, Tzoumas, Carlone, RA-L 2020 (GNC-TLS); eq. (6).
     """
     check_problem(problem)
+    check_precision(problem)
     check_settings(settings)
     if np.shape(gnc_mu) != () or (
         not is_traced(gnc_mu) and not (np.isfinite(float(gnc_mu)) and float(gnc_mu) > 0)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from teaser_jax.cascade import find_cascade
 from teaser_jax.ground.steps import Run, plainly
 from teaser_jax.pose import Pose
-from teaser_jax.problem import Problem, clean
+from teaser_jax.problem import Problem, check_precision, clean
 from teaser_jax.refit import cascade_pose, check_problem, joint_pose
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Selection, Solution
@@ -57,7 +57,8 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
         The pose from the source to the target frame and what it rests on. Finite always.
 
     Raises:
-        ValueError: On anything but one ``Problem`` and ``Settings``.
+        ValueError: On anything but one ``Problem`` and ``Settings``; on a problem in numpy whose bound is lost
+            in float32, unless JAX's x64 is on.
 
     Gradients: exact through ``refit`` as long as the chosen sets do not change, that is almost
     everywhere; the sets themselves carry none (``soft_solve`` differentiates through them, too). Zero
@@ -95,6 +96,7 @@ def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Int[Array, ""]]:
     """Check and clean a problem, and count the rows that are not finite."""
     check_problem(problem)
     check_settings(settings)
+    check_precision(problem)
     return clean(problem)
 
 

@@ -30,9 +30,9 @@ from teaser_jax.ground.arrays import AnyArray, Placeholder, at_least_float32, is
 from teaser_jax.ground.checks import one_of
 from teaser_jax.settings import ROTATIONS, RotationMethod, as_record, check_record
 from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
-from teaser_jax.stages.rotation.pair_search import search_pairs
+from teaser_jax.stages.rotation.pair_search import PairSearch
 from teaser_jax.stages.rotation.quadratic_form import in_frame_of
-from teaser_jax.stages.rotation.relaxation import RelaxationReport
+from teaser_jax.stages.rotation.relaxation import Relaxation, RelaxationReport
 from teaser_jax.stages.rotation.tims import listed_tims
 
 
@@ -140,7 +140,7 @@ def _traced(
     src, dst = (jnp.pad(at_least_float32(x), (grown, (0, 0))) for x in (src, dst))
     noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
     src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
-    found = _search(src, dst, noise_bound, cbar2, mask, _gnc_of(method), all_pairs=_tries_pairs(method))
+    found = _search(src, dst, noise_bound, cbar2, mask, method)
     if certified:
         certificate = certify_traced(
             src, dst, found.rotation,
@@ -158,8 +158,9 @@ def _on_host(
     k = np.shape(src)[0]
     measurements = read_measurements(src, dst, noise_bound, cbar2, mask)
     rounds = options.rounds(k)
-    gnc, all_pairs = _gnc_of(method), _tries_pairs(method)
-    found = in_float64(lambda: jax.device_get(_searched(measurements, gnc, all_pairs=all_pairs)))
+    # What runs on the host starts from a good rotation of the device's.
+    first = PairSearch(gnc=method.gnc) if isinstance(method, Relaxation) else method
+    found = in_float64(lambda: jax.device_get(_searched(measurements, first)))
     if method.needs_host:
         found = _by_relaxation(measurements, found, options, rounds=rounds, certified=certified)
     elif certified:
@@ -170,33 +171,25 @@ def _on_host(
     return replace(found, inliers=inliers)
 
 
-def _gnc_of(method: RotationMethod) -> Gnc:
-    """Return the record of graduated non-convexity, with which every method begins."""
-    return method if isinstance(method, Gnc) else method.gnc
-
-
-def _tries_pairs(method: RotationMethod) -> bool:
-    """Tell whether a method goes on to search all pairs of measurements."""
-    return not isinstance(method, Gnc)
-
-
-@partial(jax.jit, static_argnames="all_pairs", compiler_options=QUICKLY)
-def _searched(measurements: HostMeasurements, gnc: Gnc, *, all_pairs: bool) -> RotationSolution:
+@partial(jax.jit, compiler_options=QUICKLY)
+def _searched(measurements: HostMeasurements, method: RotationMethod) -> RotationSolution:
     """Search for the rotation in one compiled program."""
-    return _search(**measurements._asdict(), gnc=gnc, all_pairs=all_pairs)
+    return _search(**measurements._asdict(), method=method)
 
 
 def _search(
     src: Float[Array, "k 3"], dst: Float[Array, "k 3"], noise_bound: Any, cbar2: Any, mask: Any,
-    gnc: Gnc, *, all_pairs: bool,
+    method: RotationMethod,
 ) -> RotationSolution:  # fmt: skip
-    """Find a rotation by graduated non-convexity, and a better one if pairs of measurements know of one."""
+    """Find a rotation by graduated non-convexity, and turn it as the method asks."""
     dtype, eye = src.dtype, jnp.eye(3, dtype=src.dtype)
     m, _, constant = in_frame_of(eye, src, dst, noise_bound=noise_bound, cbar2=cbar2, mask=mask, dtype=dtype)
     listed = listed_tims(m.src, m.dst, jnp.ones(len(m.src), dtype), m.mask)
+    gnc = method if isinstance(method, Gnc) else method.gnc
     rotation = gnc_rotation(listed, gnc, cbar2=m.cbar2, dtype=dtype).rotation
-    if all_pairs:
-        rotation = jnp.matmul(rotation, search_pairs(m.turned(rotation)), precision=lax.Precision.HIGHEST)
+    if not isinstance(method, Gnc):
+        turn = method.turn(m.turned(rotation))
+        rotation = jnp.matmul(rotation, turn, precision=lax.Precision.HIGHEST)
     r2 = jnp.sum((dst - so3.rotate(rotation, src)) ** 2, axis=1)
     inliers = mask & (r2 <= cbar2 * noise_bound**2)
     return RotationSolution(rotation, inliers, m.turned(rotation).cost + constant)

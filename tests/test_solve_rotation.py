@@ -10,6 +10,7 @@ from oracles import BOUND, draw_vectors, rotation_cost
 
 import teaser_jax as tj
 from teaser_jax.certify.certificate import CertificateStatus
+from teaser_jax.settings import Gnc, PairSearch
 from teaser_jax.so3 import rotation_angle
 
 
@@ -111,3 +112,13 @@ def test_bad_input_is_refused(unchecked, change, words):
     src, dst, _ = draw_vectors(0, 12, 0.0)
     with pytest.raises(ValueError, match=words):
         tj.solve_rotation(**(dict(src=src, dst=dst, noise_bound=BOUND) | change))
+
+
+def test_the_record_is_asked_for_its_turn(monkeypatch):
+    """A method that is added turns the rotation by itself, and not by the search over pairs."""
+    asked = []
+    turn = PairSearch.turn
+    monkeypatch.setattr(PairSearch, "turn", lambda self, m: asked.append(self) or turn(self, m))
+    a = np.random.default_rng(0).normal(size=(9, 3))
+    tj.solve_rotation(a, a, noise_bound=0.1, method=PairSearch(gnc=Gnc(iterations=7)), proof=None)
+    assert asked

@@ -36,7 +36,8 @@ def whole_number(
         ValueError: Or ``error``, if the value is no whole number, or out of range.
     """
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise error(f"{name} is {value!r}: expected {what}, {least} or above.")
+        kind = "" if "whole number" in what else "a whole number, "
+        raise error(f"{name} is {value!r}: expected {kind}{what}, {least} or above.")
     if below is not None and int(value) >= below:
         raise error(f"{name} is {value!r}: expected {what} below {below}.")
     return int(value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,9 @@ from teaser_jax.stages.rotation.pair_search import PairSearch
 from teaser_jax.stages.rotation.quadratic_form import in_frame_of
 from teaser_jax.stages.rotation.relaxation import Relaxation
 from teaser_jax.stages.rotation.tims import Rotation, Tims, descend, listed_tims
+
+# The methods there are: a record each.
+RotationMethod: TypeAlias = Gnc | PairSearch | Relaxation
 
 
 class ListedTims(NamedTuple):
@@ -25,7 +28,7 @@ class ListedTims(NamedTuple):
 
 
 def robust_rotation(
-    listed: ListedTims, every: Tims | None, *, method: Gnc | PairSearch | Relaxation, cbar2: Float[Array, ""]
+    listed: ListedTims, every: Tims | None, *, method: RotationMethod, cbar2: Float[Array, ""]
 ) -> Rotation:
     """Find the rotation (12) of TIMs, and which of them agree with it.
 
