@@ -57,8 +57,8 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
         The pose from the source to the target frame and what it rests on. Finite always.
 
     Raises:
-        ValueError: On anything but one ``Problem`` and ``Settings``; on a problem in numpy whose bound is lost
-            in float32, unless JAX's x64 is on.
+        ValueError: On anything but one ``Problem`` and ``Settings``; on a problem in numpy whose bound is
+            lost in float32, unless JAX's x64 is on.
 
     Gradients: exact through ``refit`` as long as the chosen sets do not change, that is almost
     everywhere; the sets themselves carry none (``soft_solve`` differentiates through them, too). Zero
