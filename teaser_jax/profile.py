@@ -18,7 +18,9 @@ from teaser_jax.ground.arrays import is_traced
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import clean, host_problem
 from teaser_jax.register import INSIDE_JIT, Registration
+from teaser_jax.rows import arrange_on_host, in_rows
 from teaser_jax.settings import Settings, check_settings
+from teaser_jax.solution import as_asked
 from teaser_jax.solve import conclude, prepare
 from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
 
@@ -73,9 +75,11 @@ def profile(
     if is_traced(src, dst, settings, known):
         raise ValueError(INSIDE_JIT.format("profile"))
     problem = host_problem(src, dst, **known)
-    on_host = {"centre", "clique, host"} | ({"rotation"} if settings.rotation.needs_host else set())
+    on_host = {"rows", "centre", "clique, host"} | ({"rotation"} if settings.rotation.needs_host else set())
     timed = Stopwatch(repeats, frozenset(on_host))
-    near = timed("centre", centred, problem)
+    points = np.concatenate([problem.src.T, problem.dst.T])
+    rows = timed("rows", arrange_on_host, points, problem.mask, problem.noise_bound, problem.confidence)
+    near = timed("centre", centred, in_rows(problem, rows))
     sent = pack_problem(near.problem, settings, size_of(problem))
     with jax.enable_x64(True):
         p, excluded = timed("clean", clean, unpack_problem(sent))
@@ -84,6 +88,7 @@ def profile(
         clique = timed("clique, host", finish_on_host, settings.clique, graph.edge_bits, sent.mask, found)
         solution = jax.device_get(conclude(p, excluded, graph, clique, settings, run=timed))
     solution = without_padding(with_origins(solution, near.src_origin, near.dst_origin), problem)
+    solution = as_asked(solution, rows, has_pairs=problem.pairs is not None)
     medians = {name: float(np.median(seconds)) for name, seconds in timed.warm.items()}
     return Profile(timed.cold, medians, Registration.of(problem, solution))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,9 +12,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.arrays import AnyArray, is_traced
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
+from teaser_jax.rows import in_rows
 from teaser_jax.solution import Selection
 from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
 from teaser_jax.stages.refinement import fit_similarity
@@ -63,16 +65,42 @@ def refit(problem: Problem, selection: Selection) -> Pose:
 
 def _refit(problem: Problem, selection: Selection) -> Pose:
     """Compute the pose; problem and selection belong together."""
-    cleaned, _ = clean(problem)
-    selection = jax.tree.map(jnp.asarray, selection)
-    return lax.cond(
-        selection.refined,
-        lambda: joint_pose(cleaned, selection),
-        lambda: cascade_pose(cleaned, selection),
-    )
+    p, chosen = as_solved(clean(problem)[0], jax.tree.map(jnp.asarray, selection))
+    return lax.cond(chosen.refined, lambda: joint_pose(p, chosen), lambda: cascade_pose(p, chosen))
 
 
 _compiled = jax.jit(_refit)
+
+
+def as_solved(p: Problem, selection: Selection) -> tuple[Problem, Selection]:
+    """Put a clean problem and its sets into the rows in which they were found, with the widened bounds."""
+    p = widened(p, selection.widening)
+    rows = selection.rows
+    if rows is None:
+        return p, selection
+    of_rows = selection.rotation.dtype == bool and p.pairs is None
+    p = in_rows(p, rows)
+    found = replace(
+        selection,
+        clique=selection.clique[rows.order] & p.mask,
+        rotation=selection.rotation[rows.order] if of_rows else selection.rotation,
+        translation=selection.translation[rows.order] & p.mask[:, None],
+        inliers=selection.inliers[rows.order] & p.mask,
+        rows=None,
+    )
+    return p, found
+
+
+def as_judged(problem: Problem, selection: Selection) -> Problem:
+    """Mask the copies of a problem and widen its bounds, in the user's rows; traced or in numpy."""
+    if selection.rows is not None:
+        problem = replace(problem, mask=problem.mask & selection.rows.alone)
+    return widened(problem, selection.widening)
+
+
+def widened(problem: Problem, widening: Float[AnyArray, ""]) -> Problem:
+    """Widen the bounds of a problem by what the fit itself is uncertain of."""
+    return replace(problem, noise_bound=problem.noise_bound * widening)
 
 
 def check_problem(problem: Any) -> None:

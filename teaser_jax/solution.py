@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt32
 from teaser_jax.ground.arrays import AnyArray, Placeholder
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
+from teaser_jax.rows import Rows, in_users_order
 
 
 class Status(enum.IntEnum):
@@ -58,13 +59,18 @@ class Selection:
 
     Attributes:
         scale_pairs: TRIMs in the consensus of the scale: packed bit rows (bit t of word j in row
-            i is the pair (i, 32 j + t)), or a mask of the given pairs, or None: scale known.
-        clique: Members of the clique.
+            i is the pair of the matches at the places i and 32 j + t), or a mask of the given pairs, or
+            None: scale known.
+        clique: Members of the clique. Exact copies of a match are in a set with it, or out with it.
         rotation: TIMs kept by the rotation stage: by their first member (chain), packed bit rows
             (complete), or a mask of the given pairs.
         translation: Points in the consensus of each axis of the translation.
-        inliers: Joint residual within c beta_i when refined, otherwise clique and all three axes.
+        inliers: Joint residual within c w beta_i when refined, otherwise clique and all three axes.
         refined: Whether the pose is the joint fit to ``inliers``.
+        widening: w, by which all bounds were wider than asked for, because the fit has errors of its own
+            [-]; 1 where nothing was refined.
+        rows: Where the rows were solved: the chain of TIMs runs through the clique in their order. None: as
+            they are.
     """
 
     scale_pairs: UInt32[AnyArray, "... n w"] | Bool[AnyArray, "... m"] | Placeholder | None
@@ -73,6 +79,8 @@ class Selection:
     translation: Bool[AnyArray, "... n 3"] | Placeholder
     inliers: Bool[AnyArray, "... n"] | Placeholder
     refined: Bool[AnyArray, "..."] | Placeholder
+    widening: Float[AnyArray, "..."] | Placeholder
+    rows: Rows | Placeholder | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -85,11 +93,11 @@ class Solution:
         selection: The sets behind the pose.
         inliers: ``selection.inliers``, in the user's order.
         status: A ``Status`` as int32; the first failure sticks.
-        clique_size: Members of the clique.
+        clique_size: Members of the clique, copies counted once.
         clique_upper_bound: No clique of the consistency graph is larger: proved.
         clique_is_maximum: Whether the two are equal, which proves the maximum; never without pruning.
         excluded: Rows left out because they hold NaN or infinity.
-        cost: The joint cost (6) of the pose [-].
+        cost: The joint cost (6) of the pose, with the widened bounds and copies counted once [-].
     """
 
     pose: Pose
@@ -141,3 +149,23 @@ def problem_and_solution(problem: Any, solution: Any, caller: str) -> tuple[Prob
             f"{np.shape(solution.inliers)}: expected a problem and its own solution."
         )
     return problem, solution
+
+
+def as_asked(solution: Solution, rows: Rows, *, has_pairs: bool) -> Solution:
+    """Carry the sets of a solution, or of a stack, from their places to the user's rows."""
+    selection = with_rows(solution.selection, rows, has_pairs=has_pairs)
+    return replace(solution, selection=selection, inliers=selection.inliers)
+
+
+def with_rows(selection: Selection, rows: Rows, *, has_pairs: bool) -> Selection:
+    """Carry the sets of a selection to the user's rows; sets of pairs stay at the places of their matches."""
+    s = selection
+    of_rows = s.rotation.dtype == bool and not has_pairs
+    return replace(
+        s,
+        clique=in_users_order(s.clique, rows),
+        rotation=in_users_order(s.rotation, rows) if of_rows else s.rotation,
+        translation=in_users_order(s.translation, rows),
+        inliers=in_users_order(s.inliers, rows),
+        rows=rows,
+    )

@@ -1,7 +1,7 @@
 """The whole method on one page: choose discretely, estimate smoothly.
 
-    clean      rows that cannot be used are masked, once
-    prepare    the scale, and which matches agree on it
+    clean      rows that cannot be used are masked, once; copies are merged; the order is the method's own
+    prepare    the scale, how wide the bounds are, and which matches agree
     search     the largest set of matches that agree pairwise
     choose     rotation, translation, refinement: which measurements to trust
     refit      the pose from those sets, in closed form: gradients flow
@@ -23,22 +23,25 @@ from teaser_jax.cascade import find_cascade
 from teaser_jax.ground.steps import Run, plainly
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, check_precision, clean
-from teaser_jax.refit import cascade_pose, check_problem, joint_pose
+from teaser_jax.refit import cascade_pose, check_problem, joint_pose, widened
+from teaser_jax.rows import Rows, arrange, in_rows
 from teaser_jax.settings import Settings, check_settings
-from teaser_jax.solution import Selection, Solution
+from teaser_jax.solution import Selection, Solution, as_asked, with_rows
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import maximum_clique
 from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.refinement import Refinement, refine, squared_residuals, truncated_cost
 from teaser_jax.stages.scale import ScalePairs, estimate_scale
 from teaser_jax.stages.verdict import evidence_of, status_of
+from teaser_jax.stages.widening import bound_widening
 
 
 class Graph(NamedTuple):
-    """What is known before the clique: the scale, who voted for it, and which matches agree."""
+    """What is known before the clique: the scale, who voted for it, how wide bounds are, who agrees."""
 
     scale: Float[Array, ""]
     scale_pairs: ScalePairs | None
+    widening: Float[Array, ""]
     edge_bits: UInt32[Array, "n w"]
 
 
@@ -66,11 +69,11 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
 
     References: Yang, Shi, Carlone, T-RO 2021, Algorithm 1 with MCIS (section VI-D) and GNC (section X).
     """
-    cleaned, excluded = _at_the_door(problem, settings)
-    frozen = lax.stop_gradient(cleaned)
+    p, rows, excluded = _at_the_door(problem, settings)
+    frozen = lax.stop_gradient(p)
     graph = prepare(frozen, settings)
     clique = maximum_clique(graph.edge_bits, frozen.mask, settings.clique)
-    return conclude(cleaned, excluded, graph, clique, settings)
+    return as_asked(conclude(p, excluded, graph, clique, settings), rows, has_pairs=p.pairs is not None)
 
 
 def select(problem: Problem, settings: Settings = Settings()) -> Selection:
@@ -86,24 +89,30 @@ def select(problem: Problem, settings: Settings = Settings()) -> Selection:
 
     Gradients: none, the sets are choices. Differentiate ``refit``.
     """
-    frozen = lax.stop_gradient(_at_the_door(problem, settings)[0])
+    p, rows, _ = _at_the_door(problem, settings)
+    frozen = lax.stop_gradient(p)
     graph = prepare(frozen, settings)
     clique = maximum_clique(graph.edge_bits, frozen.mask, settings.clique)
-    return choose(frozen, graph, clique, settings)[0]
+    chosen, _ = choose(widened(frozen, graph.widening), graph, clique, settings)
+    return with_rows(chosen, rows, has_pairs=p.pairs is not None)
 
 
-def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Int[Array, ""]]:
-    """Check and clean a problem, and count the rows that are not finite."""
+def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Rows, Int[Array, ""]]:
+    """Check and clean a problem, put it into its rows, and count the rows that are not finite."""
     check_problem(problem)
     check_settings(settings)
     check_precision(problem)
-    return clean(problem)
+    cleaned, excluded = clean(problem)
+    rows = arrange(cleaned)
+    return in_rows(cleaned, rows), rows, excluded
 
 
 def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
     """Find the scale and the consistency graph of a clean problem; edges are tested in ``edge_dtype``."""
     scale, scale_pairs = run("scale", find_scale, p, settings)
-    return Graph(scale, scale_pairs, run("consistency graph", find_edges, p, scale, dtype=edge_dtype))
+    widening = run("widening", find_widening, p, scale, settings)
+    edges = run("consistency graph", find_edges, widened(p, widening), scale, dtype=edge_dtype)
+    return Graph(scale, scale_pairs, widening, edges)
 
 
 def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScalePairs | None]:
@@ -114,6 +123,13 @@ def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScaleP
         p.src, p.dst, p.noise_bound, p.mask,
         cbar2=p.cbar2, pairs=p.pairs, criterion=settings.vote, scale_range=settings.scale_search.range,
     )  # fmt: skip
+
+
+def find_widening(p: Problem, scale: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
+    """Find by how much bounds are wider than asked for; the plain cascade takes them as they are."""
+    if settings.refine is None:
+        return jnp.ones_like(p.cbar2)
+    return bound_widening(p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs)
 
 
 def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> UInt32[Array, "n w"]:
@@ -130,8 +146,8 @@ def choose(
 ) -> tuple[Selection, Bool[Array, ""]]:  # fmt: skip
     """Choose which measurements to trust, given the clique, and tell whether every iteration settled.
 
-    The problem is clean; ``cascade`` finds rotation and translation. Gradients: none; the caller stops the
-    inputs.
+    The problem is clean and its bounds are widened; ``cascade`` finds rotation and translation. Gradients:
+    none; the caller stops the inputs.
     """
     members = clique.members & p.mask
     found = cascade(p, graph.scale, members, settings, run)
@@ -140,7 +156,8 @@ def choose(
         inliers, still = run("refinement", find_inliers, p, found.pose, settings.refine)
         settled &= still
     refined = jnp.asarray(settings.refine is not None)
-    return Selection(graph.scale_pairs, members, found.tims, found.axes, inliers, refined), settled
+    sets = (graph.scale_pairs, members, found.tims, found.axes, inliers)
+    return Selection(*sets, refined, graph.widening), settled
 
 
 def find_inliers(
@@ -158,6 +175,7 @@ def conclude(
     *, cascade: Run = find_cascade, run: Run = plainly,
 ) -> Solution:  # fmt: skip
     """Find what lies behind the clique: the sets, the pose, and whether to trust it."""
+    p = widened(p, graph.widening)
     frozen, graph, clique = lax.stop_gradient((p, graph, clique))
     selection, settled = choose(frozen, graph, clique, settings, cascade=cascade, run=run)
     pose = run("refit", joint_pose if settings.refine else cascade_pose, p, selection)

@@ -177,6 +177,9 @@ class _Central(NamedTuple):
 @jax.jit
 def _about_the_middle(problem: Problem, solution: Solution, sigma: Any) -> _Central:
     p, _ = clean(problem)
+    if solution.selection.rows is not None:  # a copy says nothing new
+        p = replace(p, mask=p.mask & solution.selection.rows.alone)
+    solution = replace(solution, inliers=solution.inliers & p.mask)
     pose = jax.tree.map(jnp.asarray, solution.pose)
     deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)
     # About the inliers' middle, where turns and shifts hardly depend on each other: about a far origin the

@@ -16,8 +16,9 @@ PACKAGE = Path(__file__).parents[1] / "teaser_jax"
 ORDER = [
     "ground.arrays", "ground.checks", "ground.numbers", "ground.loops", "ground.bits", "ground.masked",
     "ground.io", "ground.steps",
-    "so3", "pose", "reading", "problem", "solution",
+    "so3", "pose", "reading", "problem", "rows", "solution",
     "stages.pairs", "stages.vote.sweep", "stages.vote.histogram", "stages.scale", "stages.consistency",
+    "stages.widening",
     "stages.clique.clique", "stages.clique.every_match", "stages.clique.greedy", "stages.clique.oracle",
     "stages.clique.reduction", "stages.clique.branching", "stages.clique.exact", "stages.clique.maximum",
     "stages.rotation.tims", "stages.rotation.gnc", "stages.rotation.quadratic_form",

@@ -57,7 +57,7 @@ class InlierSet:
     @classmethod
     def of(cls, problem: Problem, pose: Pose, chosen: Bool[np.ndarray, " n"]) -> InlierSet:
         """Collect the chosen matches of a problem, as a pose leaves them."""
-        p = problem
+        p, chosen = problem, chosen & problem.mask
         src, dst, bounds = (np.asarray(x)[chosen] for x in (p.src, p.dst, p.noise_bound))
         residuals = dst - np.asarray(pose.apply(src))
         return cls(src, residuals, np.sqrt(p.cbar2) * bounds, pose, p.scale is not None)

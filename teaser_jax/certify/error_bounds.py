@@ -23,7 +23,7 @@ from teaser_jax.ground.arrays import is_traced
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
-from teaser_jax.refit import cascade_pose
+from teaser_jax.refit import as_judged, as_solved, cascade_pose
 from teaser_jax.solution import Selection, Solution, problem_and_solution
 
 
@@ -96,12 +96,13 @@ def error_bounds(
     p, s = on_host((problem, solution))
     certificate = certify(p, s, about="chain") if certificate is None else certificate
     cascade = in_float64(lambda: jax.device_get(_cascade(p, s.selection)))
-    agreed = InlierSet.of(p, cascade, s.selection.clique & s.selection.translation.all(axis=1))
+    judged = as_judged(p, s.selection)
+    agreed = InlierSet.of(judged, cascade, s.selection.clique & s.selection.translation.all(axis=1))
     return ErrorBounds(
-        whole_set(InlierSet.of(p, s.pose, s.inliers), wrong),
+        whole_set(InlierSet.of(judged, s.pose, s.inliers), wrong),
         *paper_bounds(agreed),
         cascade=cascade,
-        contracts=contracts(p, s, agreed, certificate),
+        contracts=contracts(judged, s, agreed, certificate),
         certificate=certificate,
     )
 
@@ -109,4 +110,4 @@ def error_bounds(
 @jax.jit
 def _cascade(problem: Problem, selection: Selection) -> Pose:
     """Compute the pose of the plain cascade on the chosen sets, as one program."""
-    return cascade_pose(clean(problem)[0], selection)
+    return cascade_pose(*as_solved(clean(problem)[0], selection))

@@ -21,6 +21,7 @@ from teaser_jax.certify.traced import certify_traced
 from teaser_jax.ground.arrays import AnyArray, is_traced, namespace
 from teaser_jax.ground.checks import one_of
 from teaser_jax.problem import Problem, clean
+from teaser_jax.refit import as_judged
 from teaser_jax.solution import Solution, problem_and_solution
 
 MAX_TRACED = 128  # measurements under jit, where sizes are static
@@ -156,10 +157,10 @@ def _nothing_proved_where(too_many: Bool[Array, ""], found: Certificate) -> Cert
 
 def with_gaps(found: Certificate, problem: Problem, solution: Solution) -> Certificate:
     """Add what the bound on the clique says of every pose: the inliers of any pose are a clique, too."""
-    p = problem
+    p = as_judged(problem, solution.selection)
     xp = namespace(p.src, solution.clique_upper_bound)
     most = xp.asarray(solution.clique_upper_bound)
-    gap = most - xp.sum(solution.inliers, dtype=most.dtype)
+    gap = most - xp.sum(solution.inliers & p.mask, dtype=most.dtype)
     unexplained = (xp.sum(_usable(p), dtype=most.dtype) - most).astype(p.cbar2.dtype) * p.cbar2
     explained_gap = (solution.cost - unexplained) / (xp.maximum(most, 1).astype(p.cbar2.dtype) * p.cbar2)
     return replace(found, inlier_gap=gap.astype(np.int32), explained_gap=explained_gap)

@@ -14,7 +14,7 @@ from teaser_jax.certify.host import in_float64
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.problem import Problem, clean
-from teaser_jax.refit import cascade_pose
+from teaser_jax.refit import as_judged, as_solved, cascade_pose
 from teaser_jax.solution import Selection, Solution
 from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
 
@@ -41,8 +41,8 @@ class Subject(NamedTuple):
 def subject_on_host(problem: Problem, solution: Solution, about: About) -> Subject:
     """Choose the vectors to certify against, any number, on the host: problem and solution are in numpy."""
     if about == "pose":  # plain numpy: it is what is called most
-        return _about_pose(problem, solution)
-    members = int(np.sum(solution.selection.clique)) if about == "complete" else 0
+        return _about_pose(as_judged(problem, solution.selection), solution)
+    members = int(solution.clique_size) if about == "complete" else 0
     return in_float64(lambda: jax.device_get(_tims_on_host(problem, solution.selection, about, members)))
 
 
@@ -61,12 +61,12 @@ def traced_subject(
         The vectors that count, moved to the front, and whether there were more.
     """
     if about == "pose":
-        subject = _about_pose(problem, solution)
+        subject = _about_pose(as_judged(problem, solution.selection), solution)
     else:
         subject = _about_tims(problem, solution.selection, about, _most_members(about, most))
     size = min(most, subject.mask.shape[0])
     if about == "complete":
-        too_many = jnp.sum(solution.selection.clique) > _most_members(about, most)
+        too_many = solution.clique_size > _most_members(about, most)
     else:
         too_many = jnp.sum(subject.mask) > size
     return _compacted(subject, size), too_many
@@ -74,7 +74,7 @@ def traced_subject(
 
 def _about_pose(problem: Problem, solution: Solution) -> Subject:
     """Take clique and inliers, about the centroids of the inliers: the joint fit is stationary there."""
-    p, chosen = problem, solution.selection
+    p, chosen = problem, solution.selection  # bounds are widened, copies masked
     xp = namespace(p.src, chosen.inliers)
     keep = p.mask & (chosen.clique | chosen.inliers)
     # Rows outside may hold anything, and must not reach the sums.
@@ -93,6 +93,7 @@ def _tims_on_host(problem: Problem, chosen: Selection, about: About, members: in
 
 def _about_tims(p: Problem, chosen: Selection, about: About, members: int) -> Subject:
     """Take the TIMs of the clique, source scaled; of all pairs those among its first ``members``."""
+    p, chosen = as_solved(p, chosen)
     cascade = cascade_pose(p, chosen)
     clique = chosen.clique & p.mask
     if p.pairs is not None:

@@ -18,12 +18,12 @@ from jaxtyping import Bool, Int
 from teaser_jax.engine.compaction import rows_for
 from teaser_jax.engine.frames import CentredStack, centred_stack, with_origins, without_padding
 from teaser_jax.engine.groups import by_shape, pack_list
-from teaser_jax.engine.packing import PackedProblem, hide_rows, pack_problem, unpack
+from teaser_jax.engine.packing import PackedProblem, hide_rows, in_rows, pack_problem, unpack
 from teaser_jax.engine.programs import Programs, device_kind, on_mesh, run_length, sharding_over
 from teaser_jax.engine.sizes import Size, size_of
 from teaser_jax.problem import Problem
 from teaser_jax.settings import Settings
-from teaser_jax.solution import Solution
+from teaser_jax.solution import Solution, as_asked
 from teaser_jax.solve import Graph
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import finish_on_host
@@ -147,10 +147,12 @@ class Solver:
 
     def _solve(self, sent: PackedProblem, size: Size) -> Solution:
         """Solve packed problems of one size."""
+        sent, rows = in_rows(sent)
         near = centred_stack(sent)
         with jax.enable_x64(True):  # of this thread only
             runs, clique = self._find_cliques(near, size)
             solution = unpack(self._conclude(near.sent, runs, clique, size))
+        solution = as_asked(solution, rows, has_pairs=sent.pairs is not None)
         return solution if near.origins is None else with_origins(solution, *near.origins)
 
     def _find_cliques(self, near: CentredStack, size: Size) -> tuple[list[Run], Clique]:

@@ -14,6 +14,7 @@ from teaser_jax.ground.bits import words
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
 from teaser_jax.reading import extent, finite_rows
+from teaser_jax.rows import Rows
 from teaser_jax.solution import Solution
 from teaser_jax.stages.consistency import margin_of
 
@@ -155,5 +156,6 @@ def without_padding(solution: Solution, problem: Problem) -> Solution:
         rotation=of_pairs(chosen.rotation),
         translation=chosen.translation[..., :n, :],
         inliers=chosen.inliers[..., :n],
+        rows=None if chosen.rows is None else Rows(chosen.rows.order[..., :n], chosen.rows.place[..., :n]),
     )
     return replace(solution, selection=selection, inliers=selection.inliers)

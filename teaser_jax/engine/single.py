@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import jax
+import numpy as np
 
 from teaser_jax.engine.frames import centred, with_origins, without_padding
 from teaser_jax.engine.packing import fetch, pack_problem, unpack, unpack_problem
 from teaser_jax.engine.programs import ON_ONE_DEVICE
 from teaser_jax.engine.sizes import size_of
 from teaser_jax.problem import Problem, clean
+from teaser_jax.rows import arrange_on_host, in_rows
 from teaser_jax.settings import Settings
-from teaser_jax.solution import Solution
+from teaser_jax.solution import Solution, as_asked
 from teaser_jax.solve import conclude
 from teaser_jax.stages.clique.maximum import finish_on_host
 
@@ -20,7 +22,10 @@ def solve_one(problem: Problem, settings: Settings) -> Solution:
 
     Whether JAX's 64-bit types are switched on does not matter.
     """
-    near = centred(problem)
+    rows = arrange_on_host(
+        np.concatenate([problem.src.T, problem.dst.T]), problem.mask, problem.noise_bound, problem.confidence
+    )
+    near = centred(in_rows(problem, rows))
     sent = pack_problem(near.problem, settings, size_of(problem))
     choices = jax.tree.structure(settings)
     with jax.enable_x64(True):
@@ -32,4 +37,5 @@ def solve_one(problem: Problem, settings: Settings) -> Solution:
             solution = jax.device_get(conclude(cleaned, excluded, graph, clique, settings))
         else:
             solution = unpack(fetch(ON_ONE_DEVICE.after(sent, graph, clique, choices)))
-    return without_padding(with_origins(solution, near.src_origin, near.dst_origin), problem)
+    found = without_padding(with_origins(solution, near.src_origin, near.dst_origin), problem)
+    return as_asked(found, rows, has_pairs=problem.pairs is not None)

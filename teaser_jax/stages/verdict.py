@@ -9,7 +9,6 @@ and wrong; ``benchmarks/trust.py`` measures what they are worth.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from teaser_jax import so3
 from teaser_jax.ground import bits
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
+from teaser_jax.rows import keys
 from teaser_jax.solution import Status
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
 
@@ -36,9 +36,8 @@ LEAST_SHARE_OF_CLIQUE = 0.25
 MOST_SHARE_OF_MIRROR = 1.25
 # How far refinement may carry a scale out of the range it was looked for in.
 SCALE_SLACK = 0.02
-# Odd numbers that mix the bits of the six words of a row, and of their sum.
-MIX_ROW = np.array([0x9E3779B1, 0x85EBCA6B, 0xC2B2AE35, 0x27D4EB2F, 0x165667B1, 0x7FEB352D], np.uint32)
-MIX_SUM = np.uint32(0x7FEB352D)
+# Of the two slots that a point is sent to.
+SLOTS = np.array([2, 0x3C6EF362], np.uint32)
 # Poses by chance that are tolerated, as a natural logarithm: one in a hundred.
 LARGEST_LOG_FALSE_ALARMS = float(np.log(1e-2))
 
@@ -50,7 +49,8 @@ class Evidence(NamedTuple):
         usable: Matches that can be used at all.
         members: Matches in the clique.
         inliers: Matches that the pose explains.
-        distinct: Those of them that are no copies of another row.
+        distinct: Points among them, of the source or of the target, whichever are fewer: many matches of one
+            point are one piece of evidence.
         is_determined: Whether they fix the rotation, and with it the scale.
         log_false_alarms: How many poses with as many inliers chance would give, as a logarithm.
         has_collapsed: Whether most members of the clique found no place in the pose.
@@ -98,11 +98,9 @@ def evidence_of(
     """
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
-    # A match that is listed again says nothing new.
-    once = ~repeats(problem)
-    alarms = log_false_alarms(
-        replace(problem, mask=problem.mask & once), pose, inliers & once, bits.count(edge_bits)
-    )
+    points = [inliers & ~repeats(x, inliers) for x in (problem.src, problem.dst)]
+    distinct = jnp.minimum(*(jnp.sum(x, dtype=jnp.int32) for x in points))
+    alarms = log_false_alarms(problem, pose, inliers, bits.count(edge_bits), distinct)
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
     low, high = scale_range
@@ -111,7 +109,7 @@ def evidence_of(
         usable=jnp.sum(problem.mask, dtype=jnp.int32),
         members=members,
         inliers=agreeing,
-        distinct=jnp.sum(inliers & once, dtype=jnp.int32),
+        distinct=distinct,
         is_determined=is_determined(problem, pose, inliers),
         log_false_alarms=alarms,
         has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
@@ -154,23 +152,23 @@ def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array
     return by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype)
 
 
-def repeats(problem: Problem) -> Bool[Array, " n"]:
-    """Tell which matches are exact copies of an earlier row.
+def repeats(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> Bool[Array, " n"]:
+    """Tell which points are exact copies of an earlier chosen one.
 
-    Each row is sent to a slot by a hash of its numbers, and compared with the first row that came
-    there. Two different rows in one slot hide copies from each other: one in sixteen at most.
+    Each is sent to two slots by a hash of its coordinates, and compared with the first one that came there.
+    Only where both slots were taken by another point is a copy missed: one in some hundred.
     """
-    n = problem.src.shape[0]
+    n = points.shape[0]
     if n == 0:
         return jnp.zeros(0, bool)
-    rows = jnp.concatenate([problem.src, problem.dst], axis=1)
-    words = lax.bitcast_convert_type(rows.astype(jnp.float32), jnp.uint32)
-    mixed = jnp.sum(words * MIX_ROW[None], axis=1, dtype=jnp.uint32)
-    slots_log2 = max(4, (16 * n - 1).bit_length())
-    slot = ((mixed ^ (mixed >> 15)) * MIX_SUM >> (32 - slots_log2)).astype(jnp.int32)
+    key, width = keys(points.T), max(4, (16 * n - 1).bit_length())
     index = jnp.arange(n, dtype=jnp.int32)
-    first = jnp.full(1 << slots_log2, n - 1, jnp.int32).at[slot].min(index)[slot]
-    return (first < index) & jnp.all(rows == rows[first], axis=1)
+    found = jnp.zeros(n, bool)
+    for factor in SLOTS:
+        slot = (key * factor >> (32 - width)).astype(jnp.int32)
+        first = jnp.full(1 << width, n - 1, jnp.int32).at[slot].min(jnp.where(chosen, index, n - 1))[slot]
+        found |= (first < index) & jnp.all(points == points[first], axis=1)
+    return found
 
 
 def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:
@@ -196,8 +194,9 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
 
 
 def log_false_alarms(
-    problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"]
-) -> Float[Array, ""]:
+    problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"],
+    distinct: Int[Array, ""],
+) -> Float[Array, ""]:  # fmt: skip
     """Estimate the log of the expected number of poses with as many inliers if all matches were wrong.
 
     Three matches that agree on their distances make a pose; the rest of its inliers must come by
@@ -215,7 +214,7 @@ def log_false_alarms(
     mean = (jnp.sum(counts) + 1) / len(TURNS)
     excess = jnp.maximum(jnp.mean((counts - mean) ** 2) - mean, 1e-3 * mean)
     shape = mean**2 / excess
-    further = jnp.maximum(jnp.sum(inliers) - 3, 0).astype(dtype)
+    further = jnp.maximum(distinct - 3, 0).astype(dtype)
     tail = xlogy(further, further / mean) - (further + shape) * jnp.log((further + shape) / (mean + shape))
     tail = jnp.where(further > mean, tail, 0)
     degree = degrees.astype(dtype)
