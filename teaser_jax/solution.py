@@ -34,8 +34,9 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.OK: "The pose is determined by its inliers, and they agree better than chance allows.",
     Status.TOO_FEW_POINTS: (
-        "Fewer than 3 usable matches: check for non-finite rows, the mask and the confidences, and that "
-        "noise_bound, cbar2 and scale are numbers above 0; or give more matches."
+        "Fewer than 3 usable matches, exact copies counted once: check for non-finite or repeated rows, the "
+        "mask and the confidences, and that noise_bound, cbar2 and scale are numbers above 0; or give more "
+        "matches."
     ),
     Status.NO_CONSENSUS: (
         "No set of matches agrees better than wrong matches would by chance: check that the two "

@@ -153,7 +153,7 @@ def choose(
     found = cascade(p, graph.scale, members, settings, run)
     inliers, settled = members & jnp.all(found.axes, axis=1), found.settled
     if settings.refine:
-        inliers, still = run("refinement", find_inliers, p, found.pose, settings.refine)
+        inliers, still = run("refinement", find_inliers, p, found.pose, members, settings.refine)
         settled &= still
     refined = jnp.asarray(settings.refine is not None)
     sets = (graph.scale_pairs, members, found.tims, found.axes, inliers)
@@ -161,11 +161,11 @@ def choose(
 
 
 def find_inliers(
-    p: Problem, start: Pose, refinement: Refinement
+    p: Problem, start: Pose, members: Bool[Array, " n"], refinement: Refinement
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
     """Find the consensus set where the joint cost (6) stops falling, and tell whether it did stop."""
     return refine(
-        start, p.src, p.dst, p.noise_bound, p.mask,
+        start, members, p.src, p.dst, p.noise_bound, p.mask,
         scale=p.scale, cbar2=p.cbar2, iterations=refinement.iterations,
     )  # fmt: skip
 
@@ -201,9 +201,12 @@ def judge(
     settings: Settings,
 ) -> Int[Array, ""]:  # fmt: skip
     """Decide the status of a pose, from what speaks for it and against it."""
-    return status_of(
-        evidence_of(
-            p, pose, selection.inliers, selection.clique, edge_bits,
-            has_settled=settled, pruned=settings.clique.prunes, scale_range=settings.scale_search.range,
-        )
+    inliers = within = selection.inliers
+    if settings.refine:
+        p = widened(p, 1 / selection.widening)  # the bounds as given
+        within &= squared_residuals(pose, p.src, p.dst, p.noise_bound) <= p.cbar2
+    evidence = evidence_of(
+        p, pose, inliers, within, selection.clique, edge_bits,
+        has_settled=settled, pruned=settings.clique.prunes, scale_range=settings.scale_search.range,
     )  # fmt: skip
+    return status_of(evidence)

@@ -8,6 +8,7 @@ import numpy as np
 
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.solution import Solution
 
 if TYPE_CHECKING:
     from teaser_jax.register import Registration
@@ -31,10 +32,17 @@ def summary(result: Registration) -> str:
         f"  rotation     {angle:.3f} deg, quaternion (x, y, z, w) ({quaternion})",
         f"  translation  ({x:.6g}, {y:.6g}, {z:.6g})",
         f"  cost         {float(s.cost):.6g}: each match adds (residual / noise bound)^2, but cbar2 at most",
+        *_wide(s),
         *_proofs(result),
         f"  {result.status.advice}",
     ]
     return "\n".join(rows)
+
+
+def _wide(s: Solution) -> list[str]:
+    """Tell by how much bounds are wider than those given."""
+    wide = float(s.selection.widening)
+    return [] if wide == 1 else [f"{'':<15}bounds are {wide:.3g} times those given, for the fit's own error"]
 
 
 def _clique(result: Registration) -> str:

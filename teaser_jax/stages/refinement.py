@@ -2,7 +2,8 @@
 
 The cascade makes the problem solvable but estimates each unknown from its own invariants, which
 loses accuracy. From its answer, alternating the inlier set over *all* matches and the closed-form
-fit on that set descends (6) and ends at a least squares solution on its own consensus set.
+fit on that set descends (6) and ends at a least squares solution on its own consensus set. There are several
+such ends, so the descent starts more than once.
 """
 
 from __future__ import annotations
@@ -16,10 +17,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
+from teaser_jax.ground.bits import first_smallest
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.ground.numbers import count, named, settle
 from teaser_jax.pose import Pose
 from teaser_jax.stages.rotation.tims import correlation
+
+# One start takes the matches within so much of the bound. Where bounds hold, the lowest end was that of 150
+# random starts in 295 of 300 problems.
+NARROW = 0.7
 
 
 @jax.tree_util.register_dataclass
@@ -103,6 +109,7 @@ def truncated_cost(
 
 def refine(
     pose: Pose,
+    members: Bool[Array, " n"],
     src: Float[Array, "n 3"],
     dst: Float[Array, "n 3"],
     noise_bound: Float[Array, " n"],
@@ -112,9 +119,11 @@ def refine(
     cbar2: Float[Array, ""],
     iterations: int,
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
-    """Find the inlier set at the end of the descent from ``pose``, and tell whether it settled.
+    """Find the inlier set at the end of the descent, and tell whether it settled.
 
-    Each step can only lower the cost, so the descent ends.
+    Each step can only lower the cost, so a descent ends, but where depends on its start. It starts three
+    times: from the matches that ``pose`` explains, from those that it explains well, and from ``members``,
+    the clique. The lowest end counts; of equal ones the first.
 
     Gradients: none, the set is a choice; inputs must be stopped by the caller.
 
@@ -122,12 +131,20 @@ def refine(
     """
     weights = jnp.where(mask, 1 / noise_bound**2, 0)
 
-    def agree(pose: Pose) -> Array:
-        return mask & (squared_residuals(pose, src, dst, noise_bound) <= cbar2)
+    def descend(start: Array) -> tuple[Array, Array, Array]:
+        def step(state: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
+            inliers, _ = state
+            fit = fit_similarity(src, dst, jnp.where(inliers, weights, 0), scale)
+            r2 = squared_residuals(fit.pose, src, dst, noise_bound)
+            found = mask & (r2 <= cbar2)
+            return (found, truncated_cost(r2, mask, cbar2)), jnp.all(found == inliers)
 
-    def step(inliers: Array) -> tuple[Array, Array]:
-        fit = fit_similarity(src, dst, jnp.where(inliers, weights, 0), scale)
-        found = agree(fit.pose)
-        return found, jnp.all(found == inliers)
+        nothing = jnp.asarray(jnp.inf, src.dtype)
+        (found, cost), settled = until_settled(step, (start, nothing), iterations=iterations)
+        return found, cost, settled
 
-    return until_settled(step, agree(pose), iterations=iterations)
+    r2 = squared_residuals(pose, src, dst, noise_bound)
+    starts = jnp.stack([mask & (r2 <= cbar2), mask & (r2 <= NARROW**2 * cbar2), mask & members])
+    found, cost, settled = jax.vmap(descend)(starts)
+    best = first_smallest(cost)
+    return found[best], settled[best]

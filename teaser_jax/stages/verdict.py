@@ -75,6 +75,7 @@ def evidence_of(
     problem: Problem,
     pose: Pose,
     inliers: Bool[Array, " n"],
+    within: Bool[Array, " n"],
     clique: Bool[Array, " n"],
     edge_bits: UInt32[Array, "n w"],
     *,
@@ -85,9 +86,10 @@ def evidence_of(
     """Collect what speaks for a pose and against it.
 
     Args:
-        problem: Clean.
+        problem: Clean, with the bounds as given: wider ones are met more easily by chance.
         pose: The candidate, from the source to the target frame.
         inliers: The matches that it explains.
+        within: Those of them that it explains within the bounds as given.
         clique: The clique it came from.
         edge_bits: The consistency graph.
         has_settled: Whether every iteration settled.
@@ -98,9 +100,9 @@ def evidence_of(
     """
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
-    points = [inliers & ~repeats(x, inliers) for x in (problem.src, problem.dst)]
+    points = [within & ~repeats(x, within) for x in (problem.src, problem.dst)]
     distinct = jnp.minimum(*(jnp.sum(x, dtype=jnp.int32) for x in points))
-    alarms = log_false_alarms(problem, pose, inliers, bits.count(edge_bits), distinct)
+    alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits), distinct)
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
     low, high = scale_range
@@ -113,7 +115,7 @@ def evidence_of(
         is_determined=is_determined(problem, pose, inliers),
         log_false_alarms=alarms,
         has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
-        is_mirrored=is_mirrored(problem, inliers, clique),
+        is_mirrored=is_mirrored(problem, within, clique),
         has_left_range=outside if problem.scale is None else no,
         has_settled=has_settled,
     )
@@ -126,9 +128,9 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
     questions = (
         (e.usable < 3, Status.TOO_FEW_POINTS),
         # Three matches that agree on their distances always make a pose: they are no evidence.
-        ((e.members < 3) | (e.inliers <= 3), Status.NO_CONSENSUS),
+        ((e.members < 3) | (e.inliers <= 3) | e.has_left_range, Status.NO_CONSENSUS),
         (~e.is_determined, Status.DEGENERATE),
-        (by_chance | e.has_left_range | e.has_collapsed | e.is_mirrored, Status.NO_CONSENSUS),
+        (by_chance | e.has_collapsed | e.is_mirrored, Status.NO_CONSENSUS),
         (~e.has_settled, Status.NOT_CONVERGED),
     )
     verdict = jnp.int32(Status.OK)
