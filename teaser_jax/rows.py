@@ -84,7 +84,8 @@ def arrange_on_host(
     both.sort(axis=-1)
     order = (both & np.uint64(LAST)).astype(np.int32)
     place = np.empty_like(order)
-    np.put_along_axis(place, order, np.broadcast_to(np.arange(n, dtype=np.int32), order.shape), axis=-1)
+    front = () if order.ndim == 1 else (np.arange(len(order))[:, None],)
+    place[(*front, order)] = np.arange(n, dtype=np.int32)
     both >>= np.uint64(32)
     alike = (both[..., 1:] == both[..., :-1]) & (both[..., 1:] != LAST)
     if not alike.any():  # nearly always

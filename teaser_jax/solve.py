@@ -153,7 +153,7 @@ def choose(
     found = cascade(p, graph.scale, members, settings, run)
     inliers, settled = members & jnp.all(found.axes, axis=1), found.settled
     if settings.refine:
-        inliers, still = run("refinement", find_inliers, p, found.pose, members, settings.refine)
+        inliers, still = run("refinement", find_inliers, p, found.pose, settings.refine)
         settled &= still
     refined = jnp.asarray(settings.refine is not None)
     sets = (graph.scale_pairs, members, found.tims, found.axes, inliers)
@@ -161,11 +161,11 @@ def choose(
 
 
 def find_inliers(
-    p: Problem, start: Pose, members: Bool[Array, " n"], refinement: Refinement
+    p: Problem, start: Pose, refinement: Refinement
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
     """Find the consensus set where the joint cost (6) stops falling, and tell whether it did stop."""
     return refine(
-        start, members, p.src, p.dst, p.noise_bound, p.mask,
+        start, p.src, p.dst, p.noise_bound, p.mask,
         scale=p.scale, cbar2=p.cbar2, iterations=refinement.iterations,
     )  # fmt: skip
 

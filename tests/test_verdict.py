@@ -157,7 +157,7 @@ def test_repeats_are_the_later_copies(n, x64):
     _, first = np.unique(points[chosen], axis=0, return_index=True)
     later = ~np.isin(np.arange(len(found)), first)
     assert not found[~later].any()
-    assert found.sum() >= 0.97 * later.sum()  # two in one slot hide each other's copies
+    assert found.sum() >= 0.9 * later.sum()  # two in one slot hide each other's copies
 
 
 def test_many_matches_of_one_point_are_one_piece_of_evidence(x64):

@@ -3,7 +3,7 @@
 The cascade makes the problem solvable but estimates each unknown from its own invariants, which
 loses accuracy. From its answer, alternating the inlier set over *all* matches and the closed-form
 fit on that set descends (6) and ends at a least squares solution on its own consensus set. There are several
-such ends, so the descent starts more than once.
+such ends, so the descent starts twice.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from teaser_jax.ground.numbers import count, named, settle
 from teaser_jax.pose import Pose
 from teaser_jax.stages.rotation.tims import correlation
 
-# One start takes the matches within so much of the bound. Where bounds hold, the lowest end was that of 150
-# random starts in 295 of 300 problems.
+# The second start takes the matches within so much of the bound. Where bounds hold, the lower of the two ends
+# was that of 150 random starts in 286 of 300 problems, and at most 0.1 % above it in the others.
 NARROW = 0.7
 
 
@@ -109,7 +109,6 @@ def truncated_cost(
 
 def refine(
     pose: Pose,
-    members: Bool[Array, " n"],
     src: Float[Array, "n 3"],
     dst: Float[Array, "n 3"],
     noise_bound: Float[Array, " n"],
@@ -121,9 +120,9 @@ def refine(
 ) -> tuple[Bool[Array, " n"], Bool[Array, ""]]:
     """Find the inlier set at the end of the descent, and tell whether it settled.
 
-    Each step can only lower the cost, so a descent ends, but where depends on its start. It starts three
-    times: from the matches that ``pose`` explains, from those that it explains well, and from ``members``,
-    the clique. The lowest end counts; of equal ones the first.
+    Each step can only lower the cost, so a descent ends, but where depends on its start. It starts twice:
+    from the matches that ``pose`` explains, and from those that it explains well. The lower end counts; of
+    equal ones the first.
 
     Gradients: none, the set is a choice; inputs must be stopped by the caller.
 
@@ -144,7 +143,7 @@ def refine(
         return found, cost, settled
 
     r2 = squared_residuals(pose, src, dst, noise_bound)
-    starts = jnp.stack([mask & (r2 <= cbar2), mask & (r2 <= NARROW**2 * cbar2), mask & members])
+    starts = jnp.stack([mask & (r2 <= cbar2), mask & (r2 <= NARROW**2 * cbar2)])
     found, cost, settled = jax.vmap(descend)(starts)
     best = first_smallest(cost)
     return found[best], settled[best]

@@ -36,8 +36,6 @@ LEAST_SHARE_OF_CLIQUE = 0.25
 MOST_SHARE_OF_MIRROR = 1.25
 # How far refinement may carry a scale out of the range it was looked for in.
 SCALE_SLACK = 0.02
-# Of the two slots that a point is sent to.
-SLOTS = np.array([2, 0x3C6EF362], np.uint32)
 # Poses by chance that are tolerated, as a natural logarithm: one in a hundred.
 LARGEST_LOG_FALSE_ALARMS = float(np.log(1e-2))
 
@@ -157,20 +155,16 @@ def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array
 def repeats(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> Bool[Array, " n"]:
     """Tell which points are exact copies of an earlier chosen one.
 
-    Each is sent to two slots by a hash of its coordinates, and compared with the first one that came there.
-    Only where both slots were taken by another point is a copy missed: one in some hundred.
+    Each is sent to a slot by a hash of its coordinates, and compared with the first one that came there. Two
+    different points in one slot hide copies from each other: one in sixteen at most.
     """
     n = points.shape[0]
     if n == 0:
         return jnp.zeros(0, bool)
-    key, width = keys(points.T), max(4, (16 * n - 1).bit_length())
-    index = jnp.arange(n, dtype=jnp.int32)
-    found = jnp.zeros(n, bool)
-    for factor in SLOTS:
-        slot = (key * factor >> (32 - width)).astype(jnp.int32)
-        first = jnp.full(1 << width, n - 1, jnp.int32).at[slot].min(jnp.where(chosen, index, n - 1))[slot]
-        found |= (first < index) & jnp.all(points == points[first], axis=1)
-    return found
+    width, index = max(4, (16 * n - 1).bit_length()), jnp.arange(n, dtype=jnp.int32)
+    slot = (keys(points.T) >> (31 - width)).astype(jnp.int32)
+    first = jnp.full(1 << width, n - 1, jnp.int32).at[slot].min(jnp.where(chosen, index, n - 1))[slot]
+    return (first < index) & jnp.all(points == points[first], axis=1)
 
 
 def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:

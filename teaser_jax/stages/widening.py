@@ -18,7 +18,7 @@ from teaser_jax.stages.pairs import tim_bounds, tims, usable_pairs
 # From 1.5 on the answer is as good as least squares on the right matches (errors uniform in a ball of the
 # bound: 1.02 times its error; without widening 1.6 times). Wider ones let more wrong matches in.
 SHARE = 1.5
-PIVOTS = 64  # matches whose neighbours are counted
+PIVOTS = 32  # matches whose neighbours are counted
 FEWEST = 4
 
 
@@ -34,7 +34,7 @@ def bound_widening(
 ) -> Float[Array, ""]:
     """Find by how much to widen the bounds: 1 + 1.5 / sqrt(m), for about m right matches.
 
-    m is the largest number of matches that agree with one of the first 64: at least the right ones, where
+    m is the largest number of matches that agree with one of the first 32: at least the right ones, where
     there is one of them. Of given pairs it is estimated from the share that agrees.
 
     Args:
