@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import jax
 import jax.numpy as jnp
 import networkx as nx
@@ -154,6 +156,34 @@ def test_rows_that_cannot_be_used_do_not_refuse_the_others():
     make(with_entry(GOOD, 0, np.nan), with_entry(GOOD, 1, np.inf))
     make(noise_bound=with_entry(np.ones(8), 0, np.nan), mask=np.arange(8) > 0)
     make(mask=np.zeros(8, bool))
+
+
+@pytest.mark.parametrize(
+    ("shape", "advice"),
+    [
+        ((3, 7), "pass src.T"), ((4, 9), "pass src[:3].T"),
+        ((2, 9), "pass numpy.pad(src, ((0, 1), (0, 0))).T"),
+        ((9, 4), "pass src[:, :3]"), ((9, 2), "pass numpy.pad(src, ((0, 0), (0, 1)))"),
+        ((1, 9, 3), "pass src.reshape(-1, 3)"), ((9, 1, 3), "pass src.reshape(-1, 3)"),
+        ((5, 4, 3), "pass src.reshape(-1, 3)"), ((12,), "pass numpy.reshape(src, (-1, 3))"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_the_advice_for_a_wrong_shape_leads_to_points(shape, advice):
+    src = np.random.default_rng(0).normal(size=shape)
+    with pytest.raises(ValueError, match=re.escape(f"src has shape {shape}: expected (n, 3)")) as error:
+        tj.make_problem(src, src, noise_bound=0.1)
+    assert advice in str(error.value)
+    followed = eval(advice.removeprefix("pass "), {"src": src, "numpy": np})
+    problem = tj.make_problem(followed, followed, noise_bound=0.1)
+    assert problem.src.shape[1] == 3
+    assert problem.src.size >= 0.74 * src.size
+
+
+def test_a_stack_of_problems_is_sent_where_stacks_go():
+    src = np.zeros((5, 40, 3))
+    with pytest.raises(ValueError, match=r"of a stack of problems give one, src\[0\], .* solve_batch or"):
+        tj.register(src, src, noise_bound=0.1)
 
 
 def test_a_profile_repeats_at_least_once():
