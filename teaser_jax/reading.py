@@ -42,8 +42,12 @@ def real_numbers(value: Any, name: str) -> AnyArray:
 
 
 def point_rows(value: Any, name: str) -> AnyArray:
-    """Read points as (n, 3) numbers. Raises ValueError on any other shape, with the shape and what to do."""
-    array = real_numbers(value, name)
+    """Read points as (n, 3) numbers, of arrays and of clouds that others hold.
+
+    Raises:
+        ValueError: On any other shape, with the shape and what to do.
+    """
+    array = real_numbers(coordinates_of(value), name)
     shape = array.shape
     if 0 in shape:
         raise ValueError(
@@ -54,6 +58,24 @@ def point_rows(value: Any, name: str) -> AnyArray:
             f"{name} has shape {shape}: expected (n, 3), one point a row; {_way_out(name, shape)}."
         )
     return array
+
+
+def coordinates_of(value: Any) -> Any:
+    """Find the coordinates in a cloud of Open3D (either API) or in a structured array; return others as is.
+
+    Structured arrays with fields x, y, z are what readers of PCD files and ROS messages give.
+    """
+    names = getattr(getattr(value, "dtype", None), "names", None)
+    if names is not None and {"x", "y", "z"} <= set(names):
+        return np.stack([np.asarray(value[axis], np.float64) for axis in "xyz"], axis=-1)
+    if hasattr(value, "__array__") or hasattr(value, "__dlpack__"):
+        return value
+    if hasattr(value, "points") and hasattr(value, "has_points"):
+        return np.asarray(value.points)
+    positions = getattr(getattr(value, "point", None), "positions", None)
+    if positions is not None:
+        return positions.cpu().numpy() if hasattr(positions, "cpu") else positions
+    return value
 
 
 def _way_out(name: str, shape: tuple[int, ...]) -> str:

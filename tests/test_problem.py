@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -409,3 +410,60 @@ def test_a_stack_wants_vmap():
     problem = tj.make_problem(np.ones((5, 3)), np.ones((5, 3)), noise_bound=0.1)
     with pytest.raises(ValueError, match="vmap"):
         tj.solve(tj.stack_problems([problem, problem]))
+
+
+class Tensor:
+    """What matters of a tensor of PyTorch, which is not installed here."""
+
+    def __init__(self, values, dtype="torch.float32", requires_grad=False):
+        self.values, self.dtype, self.requires_grad = values, dtype, requires_grad
+
+    def float(self):
+        return Tensor(self.values)
+
+    def __array__(self, dtype=None, copy=None):
+        if self.dtype == "torch.bfloat16":
+            raise TypeError("Got unsupported ScalarType BFloat16")
+        return np.asarray(self.values, dtype)
+
+
+def test_tensors_are_read_and_none_is_detached_in_silence():
+    points = np.random.default_rng(0).normal(size=(9, 3)).astype(np.float32)
+    for tensor in (Tensor(points), Tensor(points, "torch.bfloat16")):
+        np.testing.assert_array_equal(tj.host_problem(tensor, tensor, noise_bound=0.1).src, points)
+    learned = Tensor(points, requires_grad=True)
+    with pytest.raises(ValueError, match=r"dst requires a gradient, .* pass dst.detach\(\)"):
+        tj.register(points, learned, noise_bound=0.1)
+
+
+def test_a_structured_array_is_read_by_its_names():
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    fields = [("intensity", "f4"), ("x", "f4"), ("y", "f4"), ("z", "f8"), ("ring", "u2")]
+    cloud = np.zeros(9, fields)
+    for k, axis in enumerate("xyz"):
+        cloud[axis] = points[:, k]
+    np.testing.assert_allclose(tj.host_problem(cloud, points, noise_bound=0.1).src, points, rtol=1e-6)
+    with pytest.raises(ValueError, match="src has dtype .* expected real numbers"):
+        tj.host_problem(cloud[["intensity", "ring"]], points, noise_bound=0.1)
+
+
+def test_clouds_of_open3d_are_read():
+    """By what matters of their two kinds: the library itself is tried where it can be loaded."""
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    legacy = SimpleNamespace(points=points.tolist(), has_points=lambda: True)
+    tensor = SimpleNamespace(point=SimpleNamespace(positions=jnp.asarray(points)))
+    clouds: list = [legacy, tensor]
+    try:
+        import open3d
+    except ImportError:  # not installed, or without the libraries of the system that it wants
+        pass
+    else:
+        clouds += [
+            open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points)),
+            open3d.t.geometry.PointCloud(open3d.core.Tensor(points)),
+        ]
+    for cloud in clouds:
+        found = tj.host_problem(cloud, points, noise_bound=0.1).src
+        np.testing.assert_allclose(found, points, rtol=1e-6)
+    with pytest.raises(ValueError, match="src is empty"):
+        tj.register(SimpleNamespace(points=[], has_points=lambda: False), points, noise_bound=0.1)
