@@ -44,7 +44,7 @@ def _add_register(register: argparse.ArgumentParser) -> None:
     register.add_argument(
         "matches", metavar="MATCHES", type=Path,
         help=".npz with arrays src and dst, maybe also noise_bound, scale, cbar2, mask, confidence, pairs; "
-        "or text or CSV with six columns",
+        "or .npy, text or CSV with six columns",
     )  # fmt: skip
     # Options that are not given stay absent: then the file speaks, then the defaults of tj.register.
     absent = argparse.SUPPRESS

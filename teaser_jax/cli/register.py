@@ -32,6 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     source, output, plot = arguments.matches, arguments.output, arguments.plot
     check_places(source, output, plot)
     matches = read_matches(source)
+    for sentence in matches.ignored:
+        print(f"teaser-jax: {source}: {sentence}", file=sys.stderr)
     given = vars(arguments)
     known = {**matches.known, **{name: value for name, value in given.items() if name in KNOWN}}
     if "noise_bound" not in known:
