@@ -237,8 +237,6 @@ def test_the_error_names_the_line_and_shows_what_stands_there(tmp_path, text, sa
 def test_shards_and_files_of_matlab_are_sent_where_they_belong(tmp_path):
     path = tmp_path / "shard.npz"
     np.savez(path, src=SRC[None], dst=DST[None], rotation=np.eye(3)[None], translation=0, inliers=0)
-    assert "is a shard of a study, 1 problem(s): read them with teaser_jax.studies.read_trials" in reason(
-        path
-    )
+    assert "is a shard of a study, 1 problem(s): read them with teaser_jax" in reason(path)
     (tmp_path / "m.mat").write_bytes(b"MATLAB")
     assert "numpy.savez('m.npz', **scipy.io.loadmat('m.mat'))" in reason(tmp_path / "m.mat")

@@ -125,10 +125,11 @@ def _ignored(name: str) -> str:
 
 def _read_npy(path: Path) -> MatchFile:
     table = or_file_error(path, "is no .npy array, or is broken", lambda: np.load(path, allow_pickle=False))
-    if getattr(table, "shape", ())[1:] != (6,):
+    shape = getattr(table, "shape", ())
+    if shape[1:] != (6,):
         raise FileError(
-            f"{path}: holds an array of shape {getattr(table, 'shape', None)}: expected matches, (n, 6): x y z "
-            "of the source point, then of the target. Of two clouds, match them first."
+            f"{path}: holds an array of shape {shape}: expected matches, (n, 6): x y z of the source point, then "
+            "of the target. Of two clouds, match them first."
         )
     return MatchFile(table[:, :3], table[:, 3:], {})
 
