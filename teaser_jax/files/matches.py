@@ -128,8 +128,8 @@ def _read_npy(path: Path) -> MatchFile:
     shape = getattr(table, "shape", ())
     if shape[1:] != (6,):
         raise FileError(
-            f"{path}: holds an array of shape {shape}: expected matches, (n, 6): x y z of the source point, then "
-            "of the target. Of two clouds, match them first."
+            f"{path}: holds an array of shape {shape}: expected matches, (n, 6): x y z of the source point, "
+            "then of the target. Of two clouds, match them first."
         )
     return MatchFile(table[:, :3], table[:, 3:], {})
 
