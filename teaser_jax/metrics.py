@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray, namespace
-from teaser_jax.pose import Pose
+from teaser_jax.pose import Pose, as_pose
 
 
 class PoseErrors(NamedTuple):
@@ -31,11 +31,12 @@ class PoseErrors(NamedTuple):
         return np.degrees(self.rotation)
 
 
-def errors(estimate: Pose, truth: Pose) -> PoseErrors:
+def errors(estimate: Pose | Any, truth: Pose | Any) -> PoseErrors:
     """Measure the three errors of a pose at once.
 
     Args:
-        estimate, truth: ``T_dst_src``, numpy or JAX, with any leading batch axes.
+        estimate, truth: ``T_dst_src`` as a ``Pose``, an answer or a matrix; numpy or JAX, with any leading
+            batch axes.
 
     Gradients: as those of ``rotation_error``, ``translation_error`` and ``scale_error``.
     """
@@ -44,30 +45,32 @@ def errors(estimate: Pose, truth: Pose) -> PoseErrors:
     )
 
 
-def rotation_error(estimate: Pose, truth: Pose) -> Float[AnyArray, "..."]:
+def rotation_error(estimate: Pose | Any, truth: Pose | Any) -> Float[AnyArray, "..."]:
     """Measure the angle between two rotations [rad], accurate near 0 and near pi.
 
     Gradients: NaN at 0 and pi, where the angle has kinks; ``learn.rotation_loss`` is zero there.
     """
+    estimate, truth = as_pose(estimate), as_pose(truth)
     between = so3.rotate(estimate.rotation.swapaxes(-1, -2), truth.rotation.swapaxes(-1, -2))
     return so3.rotation_angle(between)
 
 
-def translation_error(estimate: Pose, truth: Pose) -> Float[AnyArray, "..."]:
+def translation_error(estimate: Pose | Any, truth: Pose | Any) -> Float[AnyArray, "..."]:
     """Measure the distance between two translations [length].
 
     Gradients: NaN where the two are equal; ``learn.translation_loss`` is zero there.
     """
+    estimate, truth = as_pose(estimate), as_pose(truth)
     xp = namespace(estimate.translation, truth.translation)
     return xp.sqrt(xp.sum((estimate.translation - truth.translation) ** 2, axis=-1))
 
 
-def scale_error(estimate: Pose, truth: Pose) -> Float[AnyArray, "..."]:
+def scale_error(estimate: Pose | Any, truth: Pose | Any) -> Float[AnyArray, "..."]:
     """Measure the absolute difference of two scales [-].
 
     Gradients: the sign of the difference.
     """
-    return abs(estimate.scale - truth.scale)
+    return abs(as_pose(estimate).scale - as_pose(truth).scale)
 
 
 def precision_recall(found: Any, right: Any) -> tuple[float, float]:

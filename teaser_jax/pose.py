@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray, Placeholder, namespace
+from teaser_jax.ground.arrays import AnyArray, Placeholder, as_numpy, namespace
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -33,9 +33,16 @@ class Pose:
     def from_matrix(cls, matrix: Any) -> Pose:
         """Make a pose from ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is no scaled rotation."""
         xp = namespace(matrix)
-        matrix = xp.asarray(matrix)
-        if matrix.shape[-2:] != (4, 4):
-            raise ValueError(f"a pose matrix has shape (4, 4), received {matrix.shape}")
+        try:
+            matrix = xp.asarray(matrix)
+        except ValueError:
+            raise ValueError("a pose matrix has shape (4, 4), and this is no array of numbers.") from None
+        if matrix.shape[-2:] != (4, 4) or matrix.dtype.kind not in "fiu":
+            raise ValueError(
+                f"a pose matrix has shape (4, 4) and real numbers, received {matrix.shape} of {matrix.dtype}"
+            )
+        if matrix.dtype.kind != "f":
+            matrix = matrix.astype(float)
         if not isinstance(matrix, jax.core.Tracer):
             _check_similarity(np.asarray(matrix, np.float64))
         block = matrix[..., :3, :3]
@@ -56,8 +63,11 @@ class Pose:
         """Unit quaternion of the rotation, scalar last."""
         return so3.quat_from_rotation(self.rotation)
 
-    def apply(self, points: Float[AnyArray, "... n 3"]) -> Float[AnyArray, "... n 3"]:
+    def apply(self, points: Any) -> Float[AnyArray, "... n 3"]:
         """Carry source points (rows) to the target frame. Raises ValueError unless they are (..., n, 3)."""
+        points = points if isinstance(points, jax.Array) else as_numpy(points, "points")
+        if points.dtype.kind in "iu":
+            points = points.astype(float)
         if points.ndim < 2 or points.shape[-1] != 3:
             raise ValueError(f"points have shape {points.shape}: expected (n, 3), one point a row.")
         rotated = so3.rotate(self.rotation, points)
@@ -71,8 +81,20 @@ class Pose:
         moved = so3.rotate(transposed, self.translation[..., None, :])[..., 0, :]
         return Pose(transposed, -scale[..., None] * moved, scale)
 
-    def __matmul__(self, other: Pose) -> Pose:
-        """Compose two poses: ``(T_c_b @ T_b_a).apply(p) == T_c_b.apply(T_b_a.apply(p))``."""
+    # numpy asks __rmatmul__ below instead of multiplying entries.
+    __array_ufunc__ = None
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Return the matrix, for numpy."""
+        return np.array(self.matrix, dtype)
+
+    def __rmatmul__(self, other: Any) -> Pose:
+        """Compose a pose, or its matrix, with this one."""
+        return as_pose(other) @ self
+
+    def __matmul__(self, other: Pose | Any) -> Pose:
+        """Compose two poses: ``(T_c_b @ T_b_a).apply(p) == T_c_b.apply(T_b_a.apply(p))``; or a matrix."""
+        other = as_pose(other)
         moved = self.apply(other.translation[..., None, :])[..., 0, :]
         rotation = so3.rotate(self.rotation, other.rotation.swapaxes(-1, -2)).swapaxes(-1, -2)
         return Pose(rotation, moved, self.scale * other.scale)
@@ -82,6 +104,29 @@ class Pose:
         from scipy.spatial.transform import Rotation
 
         return Rotation.from_matrix(np.asarray(self.rotation))
+
+
+def as_pose(value: Any) -> Pose:
+    """Read a pose: a ``Pose``, an answer that has one, or a matrix ``[s R, t; 0, 1]`` of (4, 4) or (3, 4).
+
+    Raises:
+        ValueError: If it is none of them.
+    """
+    if isinstance(value, Pose):
+        return value
+    if isinstance(getattr(value, "pose", None), Pose):
+        return value.pose
+    if np.ndim(value) < 2:
+        raise ValueError(
+            f"received {type(value).__name__} for a pose: give a Pose, the answer of register, or a matrix "
+            "[s R, t; 0, 1] of shape (4, 4)."
+        )
+    xp = namespace(value)
+    matrix = xp.asarray(value)
+    if matrix.shape[-2:] == (3, 4):  # as KITTI writes them
+        last = xp.broadcast_to(xp.asarray([0, 0, 0, 1], matrix.dtype), (*matrix.shape[:-2], 1, 4))
+        matrix = xp.concatenate([matrix, last], axis=-2)
+    return Pose.from_matrix(matrix)
 
 
 def _check_similarity(matrix: np.ndarray) -> None:

@@ -58,7 +58,7 @@ def make_problem(
 
     Args:
         src, dst: (n, 3) points, any real dtype; integers become floats, entries that a numpy
-            masked array hides become NaN.
+            masked array hides become NaN. Clouds of Open3D and structured arrays with x, y, z are read, too.
         noise_bound: Largest error of a right match [length unit of the points], one number or (n,).
         scale: The known scale [-], or None: estimate it.
         cbar2: Truncation of the cost, c-bar squared [-].

@@ -42,21 +42,71 @@ def real_numbers(value: Any, name: str) -> AnyArray:
 
 
 def point_rows(value: Any, name: str) -> AnyArray:
-    """Read points as (n, 3) numbers. Raises ValueError on any other shape, with the shape and what to do."""
-    array = real_numbers(value, name)
+    """Read points as (n, 3) numbers, of arrays and of clouds that others hold.
+
+    Raises:
+        ValueError: On any other shape, with the shape and what to do.
+    """
+    array = real_numbers(coordinates_of(value), name)
     shape = array.shape
     if 0 in shape:
         raise ValueError(
             f"{name} is empty (shape {shape}): an answer that can be trusted needs at least 5 matches (rows)."
         )
-    if len(shape) == 2 and shape[0] == 3 and shape[1] != 3:
-        raise ValueError(f"{name} has shape {shape}: points are rows, so pass {name}.T of shape (n, 3).")
     if len(shape) != 2 or shape[1] != 3:
         raise ValueError(
-            f"{name} has shape {shape}: expected (n, 3), one point a row; pass {name}[:, :3] if more columns "
-            "follow the coordinates."
+            f"{name} has shape {shape}: expected (n, 3), one point a row; {_way_out(name, shape)}."
         )
     return array
+
+
+def coordinates_of(value: Any) -> Any:
+    """Find the coordinates in a cloud of Open3D (either API) or in a structured array; return others as is.
+
+    Structured arrays with fields x, y, z are what readers of PCD files and ROS messages give.
+    """
+    names = getattr(getattr(value, "dtype", None), "names", None)
+    if names is not None and {"x", "y", "z"} <= set(names):
+        return np.stack([np.asarray(value[axis], np.float64) for axis in "xyz"], axis=-1)
+    if hasattr(value, "__array__") or hasattr(value, "__dlpack__"):
+        return value
+    if hasattr(value, "points") and hasattr(value, "has_points"):
+        return np.asarray(value.points)
+    positions = getattr(getattr(value, "point", None), "positions", None)
+    if positions is not None:
+        return positions.cpu().numpy() if hasattr(positions, "cpu") else positions
+    return value
+
+
+def _way_out(name: str, shape: tuple[int, ...]) -> str:
+    """Tell what makes points of a wrong shape (n, 3): the advice works when it is followed."""
+    if len(shape) == 0:
+        return "one number is no point"
+    if len(shape) == 1:
+        return (
+            f"pass numpy.reshape({name}, (-1, 3)) if x, y, z follow one another"
+            if shape[0] % 3 == 0
+            else "give three coordinates for each point"
+        )
+    if len(shape) == 2 and shape[0] in (2, 3, 4) and shape[1] > shape[0]:
+        columns = {2: f"numpy.pad({name}, ((0, 1), (0, 0))).T", 3: f"{name}.T", 4: f"{name}[:3].T"}[shape[0]]
+        return f"points are rows, so pass {columns}"
+    if len(shape) == 2 and shape[1] == 2:
+        return f"points in a plane get a third coordinate: pass numpy.pad({name}, ((0, 0), (0, 1)))"
+    if len(shape) == 2 and shape[1] > 3:
+        return f"pass {name}[:, :3] if more columns follow the coordinates"
+    if len(shape) == 2:
+        return "give three coordinates for each point"
+    if shape[-1] == 3 and shape.count(1) >= len(shape) - 2:
+        return f"pass {name}.reshape(-1, 3)"
+    if shape[-1] == 3:
+        return (
+            f"pass {name}.reshape(-1, 3) if this is one organised cloud; of a stack of problems give one, "
+            f"{name}[0], at a time, or all to solve_batch or jax.vmap"
+        )
+    if shape[-2] == 3:
+        return f"points are rows, so swap the last two axes: numpy.swapaxes({name}, -1, -2)"
+    return "give three coordinates for each point"
 
 
 def one_a_match(value: Any, name: str, n: int) -> AnyArray:

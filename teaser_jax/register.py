@@ -103,7 +103,8 @@ def register(
     few programs.
 
     Args:
-        src, dst: (n, 3) points, row i with row i; anything with ``__array__`` or ``__dlpack__``.
+        src, dst: (n, 3) points, row i with row i; anything with ``__array__`` or ``__dlpack__``, clouds of
+            Open3D, structured arrays with x, y, z.
         noise_bound: Largest error of a right match, one number or (n,) [unit of the points].
         scale: Known scale [-], or None: estimate it.
         cbar2: Truncation of the cost, c-bar squared [-].

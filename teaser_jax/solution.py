@@ -24,6 +24,7 @@ class Status(enum.IntEnum):
     NO_CONSENSUS = 2
     DEGENERATE = 3
     NOT_CONVERGED = 5  # 4 is kept for answers that have a rival
+    MIRRORED = 6
 
     @property
     def advice(self) -> str:
@@ -39,12 +40,18 @@ _ADVICE = {
         "matches."
     ),
     Status.NO_CONSENSUS: (
-        "No set of matches agrees better than wrong matches would by chance: check that the two "
-        "clouds overlap and that noise_bound is in their unit, or find better matches."
+        "No set of matches agrees better than wrong matches would by chance: check that the two clouds "
+        "overlap, that noise_bound is in the unit of the target, and that scale is right (scale=None "
+        "estimates it); or find better matches."
     ),
     Status.DEGENERATE: (
-        "The inliers lie on a point or a line compared with noise_bound, so they do not determine "
-        "the rotation or the scale: add matches away from that line."
+        "The inliers lie on a point or a line compared with noise_bound, so they do not determine the "
+        "rotation or the scale: give a smaller noise_bound if it is too large for the unit of the points, or "
+        "add matches away from that line."
+    ),
+    Status.MIRRORED: (
+        "The clouds are mirror images: the matches agree pairwise, and a reflection explains them where no "
+        "rotation does. One of them is left-handed: flip any one axis of it, or swap two."
     ),
     Status.NOT_CONVERGED: (
         "An iteration cap was reached before the inliers settled: raise the iterations of Gnc or of "

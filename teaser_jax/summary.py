@@ -53,7 +53,7 @@ def _clique(result: Registration) -> str:
         return f"{size} matches agree pairwise, proved maximum"
     if size == most:
         return f"not searched: all {size} usable matches were taken"
-    limits = "see Settings.clique, clique_seconds, clique_nodes"
+    limits = "see ExactClique(seconds, nodes) in Settings, or --clique-seconds"
     return f"{size} matches agree pairwise, not proved maximum, at most {most} ({limits})"
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced, safe_norm, safe_sqrt
-from teaser_jax.pose import Pose
+from teaser_jax.pose import Pose, as_pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import refit
 from teaser_jax.solution import Solution, problem_and_solution
@@ -104,14 +104,15 @@ def covariance(
 
 
 def pose_difference(
-    pose: Pose, truth: Pose, *, convention: Convention = "right", with_scale: bool = False
+    pose: Pose | Any, truth: Pose | Any, *, convention: Convention = "right", with_scale: bool = False
 ) -> Float[Array, " d"]:
     """Compute the error of a pose in the coordinates of ``covariance``, the rotation's logarithm in full.
 
     ``error @ information @ error`` is the normalised error squared, which should follow chi^2.
 
     Args:
-        pose, truth: The answer, and what it should be: one pose each; ``jax.vmap`` for more.
+        pose, truth: The answer, and what it should be, as a ``Pose``, an answer or a matrix: one each;
+            ``jax.vmap`` for more.
         convention: As for ``covariance``.
         with_scale: Append log(s' / s).
 
@@ -124,7 +125,7 @@ def pose_difference(
     Gradients: exact, but where the rotations are opposite and the axis of the turn jumps.
     """
     _check_convention(convention)
-    pose, truth = (jax.tree.map(jnp.asarray, x) for x in (pose, truth))
+    pose, truth = (jax.tree.map(jnp.asarray, as_pose(x)) for x in (pose, truth))
     if pose.rotation.shape != (3, 3) or truth.rotation.shape != (3, 3):
         raise ValueError(
             f"the rotations have shapes {pose.rotation.shape} and {truth.rotation.shape}: expected one pose "

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -304,6 +305,8 @@ def test_the_choices_are_those_of_the_settings():
 
     assert tuple(tj.settings.CLIQUES) == arguments.CLIQUES
     assert tuple(tj.settings.ROTATIONS) == arguments.ROTATIONS
+    assert get_args(tj.settings.TimGraph) == arguments.TIM_GRAPHS
+    assert get_args(tj.settings.Criterion) == arguments.VOTES
 
 
 def test_version_and_help(capsys):
@@ -334,3 +337,24 @@ def test_a_real_pair(data_dir, capsys):
     error = strictly(capsys.readouterr().out)["error"]
     assert error["rotation_deg"] < 5
     assert error["translation"] < 0.6
+
+
+@pytest.mark.long
+def test_every_setting_of_the_search_has_an_option(matches, small, capsys):
+    options = ["--clique-seconds", "5", "--clique-nodes", "1000", "--tim-graph", "complete", "--no-refine"]
+    assert (
+        cli.main(["register", str(matches), "--noise-bound", str(small.noise_bound), "--json", *options]) == 0
+    )
+    found = json.loads(capsys.readouterr().out)
+    chosen = tj.Settings(
+        clique=tj.settings.ExactClique(seconds=5.0, nodes=1000), tim_graph="complete", refine=False
+    )
+    expected = tj.register(small.src, small.dst, noise_bound=small.noise_bound, settings=chosen)
+    np.testing.assert_allclose(found["pose"]["T_dst_src"], expected.pose.matrix, atol=1e-12)
+    known = ["register", matches, "--noise-bound", small.noise_bound]
+    assert "--clique greedy has no budget" in bad_input(
+        capsys, *known, "--clique", "greedy", "--clique-seconds", 1
+    )
+    assert "ExactClique.seconds is -1.0: expected 0 or more" in bad_input(
+        capsys, *known, "--clique-seconds", -1
+    )

@@ -115,9 +115,9 @@ def test_the_default_header_of_pandas_is_no_match(tmp_path, header):
         ("m.txt", b"\xff\xfe\x00binary\x9f", "is not text"),
         ("m.txt", b"1 2 3\n4 5 6\n", "line 1 has 3 columns: expected six"),
         ("m.csv", b"1,2,3,4,5,6,7\n", "line 1 has 7 columns: expected six"),
-        ("m.csv", b"1,2,,4,5,6\n", "line 1 holds '': expected six numbers"),
+        ("m.csv", b"1,2,,4,5,6\n", "line 1 has nothing in column 3"),
         ("m.csv", b"x,y,z,u,v,w\n# why\n\n1,2,3,4,5,6\n1,2,3\n", "line 5 has 3 columns: expected six"),
-        ("m.csv", b"1,2,3,4,5,6\n1,2,3,4,5,six\n", "line 2 holds 'six': expected six numbers"),
+        ("m.csv", b"1,2,3,4,5,6\n1,2,3,4,5,six\n", "line 2 holds 'six' in column 6: expected six numbers"),
         ("m.csv", b"a,2,3,4,5,6\n1,2,3,4,5,6\n", "line 1 holds 'a'"),
         ("m.ply", b"ply\n", "is a cloud, and matches are needed"),
         ("m.odd", b"1\n", "unknown extension '.odd'"),
@@ -182,3 +182,61 @@ def test_poses_are_written_exactly_and_whole(tmp_path):
 def test_one_line_of_bearable_length():
     assert one_line("a\nb\t c\x00d\u2028e") == "a b c d e"
     assert len(one_line("x" * 1000)) == 300
+
+
+def test_only_what_is_needed_is_read_and_the_rest_is_named(tmp_path):
+    path = tmp_path / "m.npz"
+    others = dict(weights=np.ones(4), noise_bounds=0.1, odd=np.array([{}, None], dtype=object))
+    np.savez(path, src=SRC, dst=DST, **others)
+    found = read_matches(path)
+    np.testing.assert_array_equal(found.src, SRC)
+    assert found.known == {}
+    assert found.ignored == (
+        "array 'weights' is ignored: call it 'confidence' to have it read",
+        "array 'noise_bounds' is ignored: call it 'noise_bound' to have it read",
+        "array 'odd' is ignored",
+    )
+
+
+def test_an_array_of_six_columns_holds_matches(tmp_path):
+    path = tmp_path / "m.npy"
+    np.save(path, np.concatenate([SRC, DST], axis=1))
+    np.testing.assert_array_equal(read_matches(path).dst, DST)
+    np.save(path, SRC)
+    assert "expected matches, (n, 6)" in reason(path)
+    path.write_bytes(b"x")
+    assert "is no .npy array, or is broken" in reason(path)
+
+
+def test_poses_of_three_rows_and_decimal_commas_are_understood(tmp_path):
+    path = tmp_path / "m.npz"
+    np.savez(path, src=SRC, dst=DST, T_dst_src=np.eye(4)[:3])
+    np.testing.assert_array_equal(read_matches(path).truth.matrix, np.eye(4))
+    for separator, name in ((";", "m.csv"), (" ", "m.txt"), ("\t", "m.tsv")):
+        path = tmp_path / name
+        rows = (separator.join(f"{x:.3f}".replace(".", ",") for x in row) for row in np.c_[SRC, DST])
+        path.write_text("\n".join(rows))
+        np.testing.assert_allclose(read_matches(path).src, SRC, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1,2,,4,5,6", "line 1 has nothing in column 3: leave the row out, or write nan there"),
+        ("?,?,?,?,?,?", "line 1 holds '?' in column 1"),
+        ("1 2 3 4 5 6\n1 2 3 4 5 6\x00", r"line 2 holds '6\x00' in column 6"),
+        ("1;2;3;4;5;6\n1;2;3;4;5;6\u200b", r"line 2 holds '6\u200b' in column 6"),
+    ],
+)
+def test_the_error_names_the_line_and_shows_what_stands_there(tmp_path, text, said):
+    path = tmp_path / "m.csv"
+    path.write_text(text)
+    assert said in reason(path)
+
+
+def test_shards_and_files_of_matlab_are_sent_where_they_belong(tmp_path):
+    path = tmp_path / "shard.npz"
+    np.savez(path, src=SRC[None], dst=DST[None], rotation=np.eye(3)[None], translation=0, inliers=0)
+    assert "is a shard of a study, 1 problem(s): read them with teaser_jax" in reason(path)
+    (tmp_path / "m.mat").write_bytes(b"MATLAB")
+    assert "numpy.savez('m.npz', **scipy.io.loadmat('m.mat'))" in reason(tmp_path / "m.mat")

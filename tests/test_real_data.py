@@ -45,7 +45,7 @@ def test_a_mirrored_target_is_not_ok(data_dir, folder, axis):
     for path in sorted((data_dir / folder).glob("*.npz")):
         pair = np.load(path)
         result = tj.register(pair["src"], pair["dst"] * mirror, noise_bound=ACCEPTED[folder][0])
-        assert result.status == tj.Status.NO_CONSENSUS, path.name
+        assert result.status in (tj.Status.MIRRORED, tj.Status.NO_CONSENSUS), path.name
 
 
 @pytest.mark.long

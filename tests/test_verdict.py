@@ -52,7 +52,18 @@ def test_wrong_matches_are_never_ok(n, seed):
 
 def test_a_mirror_image_has_no_pose():
     src = cloud()
-    assert status(src, moved(src * [1, 1, -1])) == tj.Status.NO_CONSENSUS
+    for mirror in (np.diag([1, 1, -1]), np.eye(3)[[0, 2, 1]], 2 * np.diag([-1, 1, 1])):
+        scale = None if mirror[0, 0] == -2 else 1.0
+        assert status(src, moved(src @ mirror.T), scale=scale) == tj.Status.MIRRORED
+        # The advice, followed: any one axis, any two.
+        for way_out in (np.diag([1, -1, 1]), np.eye(3)[[2, 1, 0]]):
+            assert status(src, moved(src @ mirror.T) @ way_out.T, scale=scale) == tj.Status.OK
+
+
+def test_few_wrong_matches_are_not_called_mirror_images():
+    for seed in range(20):
+        problem = random_problem((9, seed), n=64, outlier_rate=1.0, radius=1.0)
+        assert status(problem.src, problem.dst) != tj.Status.MIRRORED
 
 
 def test_a_line_does_not_determine_a_rotation():
@@ -204,4 +215,4 @@ def test_a_flat_cloud_mirrored_has_no_pose_either(flat, axis):
     src = parts @ draw_rotation(rng).T
     mirror = np.where(np.arange(3) == axis, -1, 1)
     assert status(src, moved(src)) == tj.Status.OK
-    assert status(src, moved(src * mirror)) == tj.Status.NO_CONSENSUS
+    assert status(src, moved(src * mirror)) == tj.Status.MIRRORED

@@ -12,6 +12,8 @@ from teaser_jax.cli.endings import BadInput
 PICTURES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")  # what matplotlib writes without further programs
 CLIQUES = ("exact", "greedy", "networkx", "none")
 ROTATIONS = ("gnc", "global", "sdp")
+TIM_GRAPHS = ("chain", "complete")
+VOTES = ("tls", "consensus")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -42,7 +44,7 @@ def _add_register(register: argparse.ArgumentParser) -> None:
     register.add_argument(
         "matches", metavar="MATCHES", type=Path,
         help=".npz with arrays src and dst, maybe also noise_bound, scale, cbar2, mask, confidence, pairs; "
-        "or text or CSV with six columns",
+        "or .npy, text or CSV with six columns",
     )  # fmt: skip
     # Options that are not given stay absent: then the file speaks, then the defaults of tj.register.
     absent = argparse.SUPPRESS
@@ -58,12 +60,7 @@ def _add_register(register: argparse.ArgumentParser) -> None:
         "--cbar2", type=float, default=absent, metavar="C",
         help="truncation of the cost (default: cbar2 in the file, or 1)",
     )  # fmt: skip
-    register.add_argument(
-        "--clique", choices=CLIQUES, default=absent, help="how to prune wrong matches (default: exact)"
-    )
-    register.add_argument(
-        "--rotation", choices=ROTATIONS, default=absent, help="how to find the rotation (default: gnc)"
-    )
+    _add_settings(register)
     register.add_argument(
         "--certify", action="store_true", help="prove how good the rotation is, and say so in the answer"
     )
@@ -75,6 +72,35 @@ def _add_register(register: argparse.ArgumentParser) -> None:
     register.add_argument(
         "-o", "--output", type=_output, metavar="TXT",
         help="write T_dst_src, 4 x 4; if the answer cannot be trusted, an older file is removed instead",
+    )  # fmt: skip
+
+
+def _add_settings(register: argparse.ArgumentParser) -> None:
+    absent = argparse.SUPPRESS
+    register.add_argument(
+        "--clique", choices=CLIQUES, default=absent, help="how to prune wrong matches (default: exact)"
+    )
+    register.add_argument(
+        "--rotation", choices=ROTATIONS, default=absent, help="how to find the rotation (default: gnc)"
+    )
+    register.add_argument(
+        "--clique-seconds", type=float, default=absent, metavar="S",
+        help="end the exact search for the clique after so many seconds, with the best so far (default: 60)",
+    )  # fmt: skip
+    register.add_argument(
+        "--clique-nodes", type=int, default=absent, metavar="N",
+        help="end it after so many branches, which is the same on every machine (default: 100 million)",
+    )  # fmt: skip
+    register.add_argument(
+        "--tim-graph", choices=TIM_GRAPHS, default=absent,
+        help="pairs of the clique that the rotation rests on (default: chain)",
+    )  # fmt: skip
+    register.add_argument(
+        "--vote", choices=VOTES, default=absent, help="how scale and translation are voted (default: tls)"
+    )
+    register.add_argument(
+        "--no-refine", dest="refine", action="store_false", default=absent,
+        help="end with the paper's plain cascade, without the joint fit",
     )  # fmt: skip
 
 

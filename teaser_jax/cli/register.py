@@ -16,8 +16,10 @@ from teaser_jax.cli.places import check_places, draw, failures_named, writing
 from teaser_jax.cli.report import as_plain_data, errors_as_text
 from teaser_jax.files.matches import KNOWN, MatchFile, read_matches
 from teaser_jax.files.poses import write_pose
+from teaser_jax.stages.clique.exact import ExactClique
 
-CHOICES = ("clique", "rotation")  # of Settings
+CHOICES = ("clique", "rotation", "tim_graph", "vote", "refine")  # of Settings
+BUDGETS = {"clique_seconds": "seconds", "clique_nodes": "nodes"}  # of ExactClique
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -30,6 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
     source, output, plot = arguments.matches, arguments.output, arguments.plot
     check_places(source, output, plot)
     matches = read_matches(source)
+    for sentence in matches.ignored:
+        print(f"teaser-jax: {source}: {sentence}", file=sys.stderr)
     given = vars(arguments)
     known = {**matches.known, **{name: value for name, value in given.items() if name in KNOWN}}
     if "noise_bound" not in known:
@@ -37,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
             "--noise-bound is missing: give the largest error of a right match, in the unit of the points"
         )
     start = time.perf_counter()
-    settings = tj.Settings(**{name: given[name] for name in CHOICES if name in given})
+    settings = _settings(given)
     result = _answer(source, matches, settings, known | {"certify": arguments.certify})
     seconds = time.perf_counter() - start
 
@@ -54,6 +58,22 @@ def run(arguments: argparse.Namespace) -> int:
         if matches.truth is not None:
             print(errors_as_text(result.pose, matches.truth, "T_dst_src of the file"))
     return OK if result.ok else UNTRUSTED
+
+
+def _settings(given: dict[str, Any]) -> tj.Settings:
+    """Make the settings that the options ask for. Raises BadInput if they contradict each other."""
+    chosen = {name: given[name] for name in CHOICES if name in given}
+    budget = {field: given[name] for name, field in BUDGETS.items() if name in given}
+    try:
+        if budget:
+            if chosen.get("clique", "exact") != "exact":
+                raise BadInput(
+                    f"--clique {chosen['clique']} has no budget: leave --clique-seconds and --clique-nodes"
+                )
+            chosen["clique"] = ExactClique(**budget)
+        return tj.Settings(**chosen)
+    except ValueError as error:
+        raise BadInput(str(error)) from error
 
 
 def _answer(path: Path, matches: MatchFile, settings: tj.Settings, known: dict[str, Any]) -> tj.Registration:

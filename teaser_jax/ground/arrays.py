@@ -131,6 +131,13 @@ def as_numpy(value: Any, name: str) -> np.ndarray:
     """
     if value is None:
         raise ValueError(f"{name} is missing: None was given where numbers are needed.")
+    if getattr(value, "requires_grad", False):  # a tensor of PyTorch
+        raise ValueError(
+            f"{name} requires a gradient, which would be lost here: pass {name}.detach(). Gradients flow "
+            "through jax.grad of solve, refit and soft_solve."
+        )
+    if str(getattr(value, "dtype", "")) == "torch.bfloat16":  # which numpy does not know
+        value = value.float()
     try:
         if isinstance(value, np.ma.MaskedArray):
             return _without_hidden(value)

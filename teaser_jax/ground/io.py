@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,13 @@ def one_line(message: object, limit: int = 300) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
+def visible(text: str, limit: int = 40) -> str:
+    """Write a text so that every character of it can be seen."""
+    return one_line(
+        "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text), limit
+    )
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a place to write, which becomes ``path`` at the end; after a failure ``path`` is as before."""
@@ -34,14 +41,25 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def read_archive(path: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` by name.
+class Archive(NamedTuple):
+    """What an ``.npz`` holds: the arrays that were asked for, and the names of all."""
+
+    arrays: dict[str, np.ndarray]
+    names: tuple[str, ...]
+
+
+def read_archive(path: Path, wanted: Collection[str] | None = None) -> Archive:
+    """Read arrays of an ``.npz`` by name; others are not even unpacked.
+
+    Args:
+        path: Where it is.
+        wanted: The names to read; None: all.
 
     Raises:
         FileError: If the file is no archive, or is broken.
         OSError: If it cannot be read.
     """
-    return or_file_error(path, "is no .npz archive, or is broken", lambda: _arrays(path))
+    return or_file_error(path, "is no .npz archive, or is broken", lambda: _arrays(path, wanted))
 
 
 def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
@@ -68,7 +86,7 @@ def os_errors_named(path: Path, what: str) -> Iterator[None]:
         raise FileError(f"{path}: {what}: {error.strerror or one_line(error)}.") from error
 
 
-def _arrays(path: Path) -> dict[str, np.ndarray]:
+def _arrays(path: Path, wanted: Collection[str] | None) -> Archive:
     # numpy closes only files that it did not open; pickled objects would run code from the file.
     with path.open("rb") as file:
         start = file.read(6)
@@ -78,4 +96,5 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
             raise ValueError("it does not begin as a zip file does")
         file.seek(0)
         archive = np.load(file, allow_pickle=False)
-        return {name: archive[name] for name in archive.files}
+        names = tuple(archive.files)
+        return Archive({name: archive[name] for name in names if wanted is None or name in wanted}, names)

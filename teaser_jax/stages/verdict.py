@@ -34,6 +34,8 @@ LEAST_SHARE_OF_CLIQUE = 0.25
 # plane both agree with all. On the real pairs mirrored it agreed with 1.3 times as many and more (with
 # equally many on one flat wall), on the same pairs as they are with 0.3 times as many at most.
 MOST_SHARE_OF_MIRROR = 1.25
+# So many matches of a clique, and half of it, must a reflection explain for the clouds to be mirror images.
+LEAST_MIRRORED = 8
 # How far refinement may carry a scale out of the range it was looked for in.
 SCALE_SLACK = 0.02
 # Poses by chance that are tolerated, as a natural logarithm: one in a hundred.
@@ -53,6 +55,7 @@ class Evidence(NamedTuple):
         log_false_alarms: How many poses with as many inliers chance would give, as a logarithm.
         has_collapsed: Whether most members of the clique found no place in the pose.
         is_mirrored: Whether a reflection explains the clique better.
+        by_reflection: Members of the clique that it explains.
         has_left_range: Whether an unknown scale left the range it was looked for in.
         has_settled: Whether every iteration settled.
     """
@@ -65,6 +68,7 @@ class Evidence(NamedTuple):
     log_false_alarms: Float[Array, ""]
     has_collapsed: Bool[Array, ""]
     is_mirrored: Bool[Array, ""]
+    by_reflection: Int[Array, ""]
     has_left_range: Bool[Array, ""]
     has_settled: Bool[Array, ""]
 
@@ -103,6 +107,7 @@ def evidence_of(
     alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits), distinct)
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
+    mirrored, by_reflection = is_mirrored(problem, within, clique)
     low, high = scale_range
     outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
     return Evidence(
@@ -113,7 +118,8 @@ def evidence_of(
         is_determined=is_determined(problem, pose, inliers),
         log_false_alarms=alarms,
         has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
-        is_mirrored=is_mirrored(problem, within, clique),
+        is_mirrored=mirrored,
+        by_reflection=by_reflection,
         has_left_range=outside if problem.scale is None else no,
         has_settled=has_settled,
     )
@@ -122,9 +128,12 @@ def evidence_of(
 def status_of(evidence: Evidence) -> Int[Array, ""]:
     """Give the verdict: the status of the first question that the evidence fails, or OK."""
     e = evidence
+    # Few wrong matches that agree pairwise are mirrored as often as not; many have a cause.
+    half = (2 * e.by_reflection >= e.members) & (e.by_reflection >= LEAST_MIRRORED)
     by_chance = (e.distinct <= 3) | (e.log_false_alarms > LARGEST_LOG_FALSE_ALARMS)
     questions = (
         (e.usable < 3, Status.TOO_FEW_POINTS),
+        (e.is_mirrored & half, Status.MIRRORED),
         # Three matches that agree on their distances always make a pose: they are no evidence.
         ((e.members < 3) | (e.inliers <= 3) | e.has_left_range, Status.NO_CONSENSUS),
         (~e.is_determined, Status.DEGENERATE),
@@ -137,8 +146,10 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
     return verdict
 
 
-def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array, " n"]) -> Bool[Array, ""]:
-    """Tell whether a reflection explains the clique better than the pose does.
+def is_mirrored(
+    problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array, " n"]
+) -> tuple[Bool[Array, ""], Int[Array, ""]]:
+    """Tell whether a reflection explains the clique better than the pose does, and how many members it does.
 
     Lengths do not tell left from right, so a mirrored cloud makes as large a clique as a right one; its
     flat parts then fit a rotation by themselves.
@@ -149,7 +160,7 @@ def is_mirrored(problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array
     by_reflection = jnp.sum(clique & (r2 <= problem.cbar2), dtype=jnp.int32)
     by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
     dtype = problem.src.dtype
-    return by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype)
+    return by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype), by_reflection
 
 
 def repeats(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> Bool[Array, " n"]:

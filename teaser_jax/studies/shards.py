@@ -132,7 +132,7 @@ def _read(path: Path) -> Iterator[Trial]:
     if not path.exists():
         raise FileError(f"{path}: no such file.")
     with os_errors_named(path, "cannot be read"):
-        arrays = read_archive(path)
+        arrays = read_archive(path).arrays
     if missing := set(SHAPES) - set(arrays):
         raise FileError(f"{path}: is no shard of problems: it lacks {', '.join(sorted(missing))}.")
     count = len(arrays["value"]) if arrays["value"].ndim else 0
