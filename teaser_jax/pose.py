@@ -39,7 +39,8 @@ class Pose:
             raise ValueError("a pose matrix has shape (4, 4), and this is no array of numbers.") from None
         if matrix.shape[-2:] != (4, 4) or matrix.dtype.kind not in "fiu":
             raise ValueError(
-                f"a pose matrix has shape (4, 4) and real numbers, received {matrix.shape} of {matrix.dtype}"
+                f"a pose matrix has shape (4, 4), received {matrix.shape} of {matrix.dtype}: give real "
+                "numbers, [s R, t; 0, 1]."
             )
         if matrix.dtype.kind != "f":
             matrix = matrix.astype(float)
