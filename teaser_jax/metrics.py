@@ -40,6 +40,7 @@ def errors(estimate: Pose | Any, truth: Pose | Any) -> PoseErrors:
 
     Gradients: as those of ``rotation_error``, ``translation_error`` and ``scale_error``.
     """
+    estimate, truth = as_pose(estimate), as_pose(truth)
     return PoseErrors(
         rotation_error(estimate, truth), translation_error(estimate, truth), scale_error(estimate, truth)
     )

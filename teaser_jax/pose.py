@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray, Placeholder, as_numpy, namespace
+from teaser_jax.ground.arrays import AnyArray, Placeholder, as_array, namespace
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -32,14 +32,12 @@ class Pose:
     @classmethod
     def from_matrix(cls, matrix: Any) -> Pose:
         """Make a pose from ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is no scaled rotation."""
+        matrix = as_array(matrix, "the pose matrix")
         xp = namespace(matrix)
-        try:
-            matrix = xp.asarray(matrix)
-        except ValueError:
-            raise ValueError("a pose matrix has shape (4, 4), and this is no array of numbers.") from None
         if matrix.shape[-2:] != (4, 4) or matrix.dtype.kind not in "fiu":
             raise ValueError(
-                f"a pose matrix has shape (4, 4) and real numbers, received {matrix.shape} of {matrix.dtype}"
+                f"a pose matrix has shape (4, 4), received {matrix.shape} of {matrix.dtype}: give real "
+                "numbers, [s R, t; 0, 1]."
             )
         if matrix.dtype.kind != "f":
             matrix = matrix.astype(float)
@@ -65,7 +63,7 @@ class Pose:
 
     def apply(self, points: Any) -> Float[AnyArray, "... n 3"]:
         """Carry source points (rows) to the target frame. Raises ValueError unless they are (..., n, 3)."""
-        points = points if isinstance(points, jax.Array) else as_numpy(points, "points")
+        points = as_array(points, "points")
         if points.dtype.kind in "iu":
             points = points.astype(float)
         if points.ndim < 2 or points.shape[-1] != 3:
@@ -121,8 +119,8 @@ def as_pose(value: Any) -> Pose:
             f"received {type(value).__name__} for a pose: give a Pose, the answer of register, or a matrix "
             "[s R, t; 0, 1] of shape (4, 4)."
         )
-    xp = namespace(value)
-    matrix = xp.asarray(value)
+    matrix = as_array(value, "the pose matrix")
+    xp = namespace(matrix)
     if matrix.shape[-2:] == (3, 4):  # as KITTI writes them
         last = xp.broadcast_to(xp.asarray([0, 0, 0, 1], matrix.dtype), (*matrix.shape[:-2], 1, 4))
         matrix = xp.concatenate([matrix, last], axis=-2)

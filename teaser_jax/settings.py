@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from teaser_jax.ground.checks import one_of
-from teaser_jax.ground.numbers import check_concrete
+from teaser_jax.ground.numbers import as_record, check_concrete
 from teaser_jax.stages.clique.clique import CliqueMethod
 from teaser_jax.stages.clique.every_match import EveryMatch
 from teaser_jax.stages.clique.exact import ExactClique
@@ -87,18 +87,6 @@ class Settings:
         chosen = [f"{each.name}={getattr(self, each.name)!r}" for each in fields(self)]
         usual = [f"{each.name}={each.default!r}" for each in fields(self)]
         return f"Settings({', '.join(x for x, default in zip(chosen, usual, strict=True) if x != default)})"
-
-
-def as_record(name: str, choice: Any, known: dict[str, Any]) -> Any:
-    """Return the record that a name stands for; anything else, a record or a placeholder of JAX, passes.
-
-    Raises:
-        ValueError: If the name is unknown.
-    """
-    if not isinstance(choice, str):
-        return choice
-    one_of(name, choice, known)
-    return known[choice]()
 
 
 def check_record(name: str, record: Any, known: dict[str, Any]) -> None:

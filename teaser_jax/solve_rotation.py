@@ -28,7 +28,8 @@ from teaser_jax.certify.relaxation import relaxed_rotation
 from teaser_jax.certify.traced import certify_traced, traced_mask
 from teaser_jax.ground.arrays import AnyArray, Placeholder, at_least_float32, is_traced
 from teaser_jax.ground.checks import one_of
-from teaser_jax.settings import ROTATIONS, RotationMethod, as_record, check_record
+from teaser_jax.ground.numbers import as_record
+from teaser_jax.settings import ROTATIONS, RotationMethod, check_record
 from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
 from teaser_jax.stages.rotation.pair_search import PairSearch
 from teaser_jax.stages.rotation.quadratic_form import in_frame_of

@@ -151,6 +151,11 @@ def as_numpy(value: Any, name: str) -> np.ndarray:
         ) from error
 
 
+def as_array(value: Any, name: str) -> AnyArray:
+    """Return an array of JAX as it is, and read any other value as numpy: ValueError if that fails."""
+    return value if isinstance(value, jax.Array) else as_numpy(value, name)
+
+
 def _without_hidden(array: np.ma.MaskedArray) -> np.ndarray:
     """Replace hidden entries, which must not come back as numbers: by NaN, or False among truth values."""
     if not np.ma.is_masked(array):

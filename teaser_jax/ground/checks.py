@@ -19,7 +19,7 @@ def whole_number(
     least: int,
     *,
     below: int | None = BELOW,
-    what: str = "a whole number",
+    what: str = "",
     error: type[ValueError] = ValueError,
 ) -> int:
     """Check an argument that counts something, and return it as an int.
@@ -29,17 +29,17 @@ def whole_number(
         value: What was received; numpy's integers are welcome, True and False are not.
         least: The smallest number that makes sense.
         below: All numbers that make sense lie below this one; None: there is no end.
-        what: What the argument is, in the words of the error.
+        what: What it counts, in the words of the error.
         error: The kind of error to raise.
 
     Raises:
         ValueError: Or ``error``, if the value is no whole number, or out of range.
     """
+    words = f"a whole number, {what}" if what else "a whole number"
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        kind = "" if "whole number" in what else "a whole number, "
-        raise error(f"{name} is {value!r}: expected {kind}{what}, {least} or above.")
+        raise error(f"{name} is {value!r}: expected {words}, {least} or above.")
     if below is not None and int(value) >= below:
-        raise error(f"{name} is {value!r}: expected {what} below {below}.")
+        raise error(f"{name} is {value!r}: expected {words} below {below}.")
     return int(value)
 
 

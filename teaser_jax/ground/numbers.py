@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Num
 
 from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
-from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.checks import one_of, whole_number
 
 # What a traced field holds: a number that is known, or an array of one; with the axes of a batch, of many.
 TracedNumber: TypeAlias = float | Num[AnyArray, "..."] | Placeholder
@@ -90,6 +90,18 @@ def settle(record: Any) -> None:
         value, rule = getattr(record, each.name), each.metadata.get(RULE)
         if rule is not None and isinstance(value, str | Real | np.bool_):
             object.__setattr__(record, each.name, _checked(record, each, value))
+
+
+def as_record(name: str, choice: Any, known: dict[str, Any]) -> Any:
+    """Return the record that a name stands for; anything else, a record or a placeholder of JAX, passes.
+
+    Raises:
+        ValueError: If the name is unknown.
+    """
+    if not isinstance(choice, str):
+        return choice
+    one_of(name, choice, known)
+    return known[choice]()
 
 
 def check_concrete(record: Any) -> None:

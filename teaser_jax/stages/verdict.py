@@ -107,7 +107,8 @@ def evidence_of(
     alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits), distinct)
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
-    mirrored, by_reflection = is_mirrored(problem, within, clique)
+    by_reflection = explained_by_reflection(problem, clique)
+    by_pose = jnp.sum(clique & within, dtype=jnp.int32)
     low, high = scale_range
     outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
     return Evidence(
@@ -118,7 +119,7 @@ def evidence_of(
         is_determined=is_determined(problem, pose, inliers),
         log_false_alarms=alarms,
         has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
-        is_mirrored=mirrored,
+        is_mirrored=by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype),
         by_reflection=by_reflection,
         has_left_range=outside if problem.scale is None else no,
         has_settled=has_settled,
@@ -146,10 +147,8 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
     return verdict
 
 
-def is_mirrored(
-    problem: Problem, inliers: Bool[Array, " n"], clique: Bool[Array, " n"]
-) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Tell whether a reflection explains the clique better than the pose does, and how many members it does.
+def explained_by_reflection(problem: Problem, clique: Bool[Array, " n"]) -> Int[Array, ""]:
+    """Count the members of the clique that the best reflection explains.
 
     Lengths do not tell left from right, so a mirrored cloud makes as large a clique as a right one; its
     flat parts then fit a rotation by themselves.
@@ -157,10 +156,7 @@ def is_mirrored(
     weights = jnp.where(clique, 1 / problem.noise_bound**2, 0)
     reflection = fit_similarity(-problem.src, problem.dst, weights, problem.scale).pose
     r2 = squared_residuals(reflection, -problem.src, problem.dst, problem.noise_bound)
-    by_reflection = jnp.sum(clique & (r2 <= problem.cbar2), dtype=jnp.int32)
-    by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
-    dtype = problem.src.dtype
-    return by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype), by_reflection
+    return jnp.sum(clique & (r2 <= problem.cbar2), dtype=jnp.int32)
 
 
 def repeats(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> Bool[Array, " n"]:

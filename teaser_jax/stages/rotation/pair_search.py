@@ -17,9 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.ground import bits
-from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.loops import until_settled
-from teaser_jax.ground.numbers import named
+from teaser_jax.ground.numbers import as_record, named
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.quadratic_form import Measurements
 
@@ -44,9 +43,7 @@ class PairSearch:
     needs_host: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.gnc, str):
-            one_of(f"{type(self).__name__}.gnc", self.gnc, (Gnc.name,))
-            object.__setattr__(self, "gnc", Gnc())
+        object.__setattr__(self, "gnc", as_record("PairSearch.gnc", self.gnc, {Gnc.name: Gnc}))
 
     def turn(self, m: Measurements) -> Float[Array, "3 3"]:
         """Find the turn from the frame of the measurements to the best rotation that the pairs lead to."""

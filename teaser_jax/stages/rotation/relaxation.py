@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax import so3
-from teaser_jax.ground.checks import one_of
-from teaser_jax.ground.numbers import named
+from teaser_jax.ground.numbers import as_record, named
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.pair_search import polish, search_pairs
 from teaser_jax.stages.rotation.quadratic_form import COLUMNS, ROWS, Measurements, cost_matrix
@@ -46,9 +45,7 @@ class Relaxation:
     needs_host: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if isinstance(self.gnc, str):
-            one_of(f"{type(self).__name__}.gnc", self.gnc, (Gnc.name,))
-            object.__setattr__(self, "gnc", Gnc())
+        object.__setattr__(self, "gnc", as_record("Relaxation.gnc", self.gnc, {Gnc.name: Gnc}))
 
     def turn(self, m: Measurements) -> Float[Array, "3 3"]:
         """Find the turn to the best rotation that pairs and relaxation lead to; ValueError inside jit."""
