@@ -11,16 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from teaser_jax.engine.frames import centred, with_origins, without_padding
+from teaser_jax.engine.frames import centred_one, with_origins, without_padding
 from teaser_jax.engine.packing import pack_problem, unpack_problem
 from teaser_jax.engine.sizes import size_of
 from teaser_jax.ground.arrays import is_traced
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import clean, host_problem
 from teaser_jax.register import INSIDE_JIT, Registration
-from teaser_jax.rows import arrange_on_host, in_rows
 from teaser_jax.settings import Settings, check_settings
-from teaser_jax.solution import as_asked
 from teaser_jax.solve import conclude, prepare
 from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
 
@@ -75,20 +73,18 @@ def profile(
     if is_traced(src, dst, settings, known):
         raise ValueError(INSIDE_JIT.format("profile"))
     problem = host_problem(src, dst, **known)
-    on_host = {"rows", "centre", "clique, host"} | ({"rotation"} if settings.rotation.needs_host else set())
+    on_host = {"centre", "clique, host"} | ({"rotation"} if settings.rotation.needs_host else set())
     timed = Stopwatch(repeats, frozenset(on_host))
-    points = np.concatenate([problem.src.T, problem.dst.T])
-    rows = timed("rows", arrange_on_host, points, problem.mask, problem.noise_bound, problem.confidence)
-    near = timed("centre", centred, in_rows(problem, rows))
-    sent = pack_problem(near.problem, settings, size_of(problem))
+    near = timed("centre", centred_one, pack_problem(problem, settings, size_of(problem)))
     with jax.enable_x64(True):
-        p, excluded = timed("clean", clean, unpack_problem(sent))
+        p, excluded = timed("clean", clean, unpack_problem(near.sent))
         graph = prepare(p, settings, edge_dtype=near.edge_dtype, run=timed)
-        found = timed("clique, device", search_on_device, settings.clique, graph.edge_bits, p.mask)
-        clique = timed("clique, host", finish_on_host, settings.clique, graph.edge_bits, sent.mask, found)
+        found = timed("clique, device", search_on_device, settings.clique, graph.edge_bits, graph.mask)
+        clique = timed("clique, host", finish_on_host, settings.clique, graph.edge_bits, graph.mask, found)
         solution = jax.device_get(conclude(p, excluded, graph, clique, settings, run=timed))
-    solution = without_padding(with_origins(solution, near.src_origin, near.dst_origin), problem)
-    solution = as_asked(solution, rows, has_pairs=problem.pairs is not None)
+    solution = without_padding(solution, problem)
+    if near.origins is not None:
+        solution = with_origins(solution, *near.origins)
     medians = {name: float(np.median(seconds)) for name, seconds in timed.warm.items()}
     return Profile(timed.cold, medians, Registration.of(problem, solution))
 

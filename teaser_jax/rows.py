@@ -58,74 +58,31 @@ def arrange(problem: Problem) -> Rows:
     here, usable = points[:, order], p.mask[order]
     copy = jnp.all(here[:, 1:] == here[:, :-1], axis=0) & usable[1:] & usable[:-1]
     leads = jnp.pad(~copy, (1, 0), constant_values=True)
-    start = bits.listed(leads)[bits.rank(leads) - 1]
-    place = jnp.zeros_like(index).at[order].set(start)
-    # Of copies the most confident one stands for all, and of those one with the smallest bound.
-    best = jnp.zeros_like(p.confidence).at[place].max(p.confidence)
-    doubt = jnp.where(p.confidence == best[place], p.noise_bound, jnp.inf)
-    least = jnp.full_like(doubt, jnp.inf).at[place].min(doubt)
-    winner = jnp.full(n, n - 1, jnp.int32).at[place].min(jnp.where(doubt == least[place], index, n - 1))
-    return Rows(jnp.where(leads, winner, order), place)
+
+    def without_copies() -> Rows:  # nearly always
+        return Rows(order, jnp.zeros_like(index).at[order].set(index))
+
+    def with_copies() -> Rows:
+        place = jnp.zeros_like(index).at[order].set(bits.listed(leads)[bits.rank(leads) - 1])
+        # Of copies the most confident one stands for all, and of those one with the smallest bound.
+        best = jnp.zeros_like(p.confidence).at[place].max(p.confidence)
+        doubt = jnp.where(p.confidence == best[place], p.noise_bound, jnp.inf)
+        least = jnp.full_like(doubt, jnp.inf).at[place].min(doubt)
+        winner = jnp.full(n, n - 1, jnp.int32).at[place].min(jnp.where(doubt == least[place], index, n - 1))
+        return Rows(jnp.where(leads, winner, order), place)
+
+    return lax.cond(jnp.any(copy), with_copies, without_copies)
 
 
-def arrange_on_host(
-    points: Float[np.ndarray, "*b 6 n"],
-    mask: Bool[np.ndarray, "*b n"],
-    noise_bound: Float[np.ndarray, "*b n"],
-    confidence: Float[np.ndarray, "*b n"],
-) -> Rows:
-    """Arrange the rows of one problem, or of a stack, as ``arrange`` does; in numpy, from its coordinates."""
-    n = points.shape[-1]
-    with np.errstate(over="ignore", invalid="ignore"):  # numbers that nobody can use
-        key = np.where(mask, keys(points), LAST)
-    both = key.astype(np.uint64)
-    both <<= np.uint64(32)
-    both |= np.arange(n, dtype=np.uint64)
-    both.sort(axis=-1)
-    order = (both & np.uint64(LAST)).astype(np.int32)
-    place = np.empty_like(order)
-    front = () if order.ndim == 1 else (np.arange(len(order))[:, None],)
-    place[(*front, order)] = np.arange(n, dtype=np.int32)
-    both >>= np.uint64(32)
-    alike = (both[..., 1:] == both[..., :-1]) & (both[..., 1:] != LAST)
-    if not alike.any():  # nearly always
-        return Rows(order, place)
-    for k in zip(*np.nonzero(alike.any(axis=-1)), strict=True) if alike.ndim > 1 else [()]:
-        _merge_copies(points[k], mask[k], noise_bound[k], confidence[k], order[k], place[k])
-    return Rows(order, place)
-
-
-def _merge_copies(
-    points: np.ndarray, mask: np.ndarray, noise_bound: np.ndarray, confidence: np.ndarray,
-    order: np.ndarray, place: np.ndarray,
-) -> None:  # fmt: skip
-    """Send the copies among the rows of one problem to the row that stands for them, in place."""
-    usable = mask & np.isfinite(noise_bound + confidence) & (noise_bound > 0) & (confidence > 0)
-    here, index = points[:, order], np.arange(len(order), dtype=np.int32)
-    copy = (here[:, 1:] == here[:, :-1]).all(axis=0) & usable[order][1:] & usable[order][:-1]
-    place[order] = np.maximum.accumulate(np.where(np.append(False, copy), 0, index))
-    ranked = np.lexsort((noise_bound, -np.where(usable, confidence, 0), place))
-    leads, first = np.unique(place[ranked], return_index=True)
-    order[leads] = ranked[first]
-
-
-def keys(points: Float[AnyArray, "*b k n"]) -> UInt32[AnyArray, "*b n"]:
+def keys(points: Float[Array, "k n"]) -> UInt32[Array, " n"]:
     """Compute a number of 31 bits for each point or match, from its coordinates as float32 knows them."""
-    xp = namespace(points)
-    narrow = (points + 0.0).astype(np.float32)  # of the two zeros one
-    words = narrow.view(np.uint32) if xp is np else lax.bitcast_convert_type(_one_zero(narrow), jnp.uint32)
-    count = words.shape[-2]
-    factors = MIX_EACH[:count].reshape((1,) * (words.ndim - 2) + (count, 1))
-    words = (words ^ (words >> np.uint32(16))) * factors
-    words = words ^ (words >> np.uint32(13))
-    found = xp.sum(words, axis=-2, dtype=np.uint32)
-    found = (found ^ (found >> np.uint32(16))) * MIX_SUM
-    return (found ^ (found >> np.uint32(15))) >> np.uint32(1)
-
-
-def _one_zero(numbers: Float[Array, "*k"]) -> Float[Array, "*k"]:
-    """Replace the zero below by the zero above; XLA leaves a sum with zero out."""
-    return jnp.where(numbers == 0, jnp.zeros_like(numbers), numbers)
+    narrow = points.astype(jnp.float32)
+    # Of the two zeros one; XLA would leave a sum with zero out.
+    words = lax.bitcast_convert_type(jnp.where(narrow == 0, jnp.zeros_like(narrow), narrow), jnp.uint32)
+    words = (words ^ (words >> 16)) * MIX_EACH[: len(words), None]
+    found = jnp.sum(words ^ (words >> 13), axis=0, dtype=jnp.uint32)
+    found = (found ^ (found >> 16)) * MIX_SUM
+    return (found ^ (found >> 15)) >> 1
 
 
 def in_rows(problem: Problem, rows: Rows) -> Problem:
@@ -133,25 +90,17 @@ def in_rows(problem: Problem, rows: Rows) -> Problem:
 
     Gradients: exact; what a copy would get goes to the row that stands for it.
     """
-    xp = namespace(problem.src)
     order, place = rows.order, rows.place
-    alone = place[order] == xp.arange(order.shape[0], dtype=order.dtype)
+    alone = place[order] == jnp.arange(order.shape[0], dtype=order.dtype)
+    # In one piece: to gather a row of numbers takes as long as to gather one.
+    parts = (problem.src, problem.dst, problem.noise_bound[:, None], problem.confidence[:, None])
+    here = jnp.concatenate(parts, axis=1)[order]
     return replace(
         problem,
-        src=problem.src[order],
-        dst=problem.dst[order],
-        noise_bound=problem.noise_bound[order],
+        src=here[:, 0:3],
+        dst=here[:, 3:6],
+        noise_bound=here[:, 6],
         mask=problem.mask[order] & alone,
-        confidence=problem.confidence[order],
+        confidence=here[:, 7],
         pairs=None if problem.pairs is None else place[problem.pairs],
     )
-
-
-def in_users_order(values: AnyArray, rows: Rows) -> AnyArray:
-    """Give each row what was found at the place of the row that stands for it, (..., n) or (..., n, k)."""
-    place = rows.place
-    if place.ndim == 1:
-        return values[place]
-    xp = namespace(values)
-    index = place[..., None] if values.ndim > place.ndim else place
-    return xp.take_along_axis(values, index, axis=place.ndim - 1)

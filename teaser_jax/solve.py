@@ -37,8 +37,10 @@ from teaser_jax.stages.widening import bound_widening
 
 
 class Graph(NamedTuple):
-    """What is known before the clique: the scale, who voted for it, how wide bounds are, who agrees."""
+    """What is known before the clique: where the rows are, and which; the scale; the bounds; who agrees."""
 
+    rows: Rows
+    mask: Bool[Array, " n"]
     scale: Float[Array, ""]
     scale_pairs: ScalePairs | None
     widening: Float[Array, ""]
@@ -69,11 +71,10 @@ def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
 
     References: Yang, Shi, Carlone, T-RO 2021, Algorithm 1 with MCIS (section VI-D) and GNC (section X).
     """
-    p, rows, excluded = _at_the_door(problem, settings)
-    frozen = lax.stop_gradient(p)
-    graph = prepare(frozen, settings)
-    clique = maximum_clique(graph.edge_bits, frozen.mask, settings.clique)
-    return as_asked(conclude(p, excluded, graph, clique, settings), rows, has_pairs=p.pairs is not None)
+    p, excluded = _at_the_door(problem, settings)
+    graph = prepare(lax.stop_gradient(p), settings)
+    clique = maximum_clique(graph.edge_bits, graph.mask, settings.clique)
+    return conclude(p, excluded, graph, clique, settings)
 
 
 def select(problem: Problem, settings: Settings = Settings()) -> Selection:
@@ -89,30 +90,29 @@ def select(problem: Problem, settings: Settings = Settings()) -> Selection:
 
     Gradients: none, the sets are choices. Differentiate ``refit``.
     """
-    p, rows, _ = _at_the_door(problem, settings)
-    frozen = lax.stop_gradient(p)
-    graph = prepare(frozen, settings)
-    clique = maximum_clique(graph.edge_bits, frozen.mask, settings.clique)
-    chosen, _ = choose(widened(frozen, graph.widening), graph, clique, settings)
-    return with_rows(chosen, rows, has_pairs=p.pairs is not None)
+    p = lax.stop_gradient(_at_the_door(problem, settings)[0])
+    graph = prepare(p, settings)
+    clique = maximum_clique(graph.edge_bits, graph.mask, settings.clique)
+    chosen, _ = choose(widened(in_rows(p, graph.rows), graph.widening), graph, clique, settings)
+    return with_rows(chosen, graph.rows, has_pairs=p.pairs is not None)
 
 
-def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Rows, Int[Array, ""]]:
-    """Check and clean a problem, put it into its rows, and count the rows that are not finite."""
+def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Int[Array, ""]]:
+    """Check and clean a problem, and count the rows that are not finite."""
     check_problem(problem)
     check_settings(settings)
     check_precision(problem)
-    cleaned, excluded = clean(problem)
-    rows = arrange(cleaned)
-    return in_rows(cleaned, rows), rows, excluded
+    return clean(problem)
 
 
 def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
     """Find the scale and the consistency graph of a clean problem; edges are tested in ``edge_dtype``."""
+    rows = run("rows", arrange, p)
+    p = in_rows(p, rows)
     scale, scale_pairs = run("scale", find_scale, p, settings)
     widening = run("widening", find_widening, p, scale, settings)
     edges = run("consistency graph", find_edges, widened(p, widening), scale, dtype=edge_dtype)
-    return Graph(scale, scale_pairs, widening, edges)
+    return Graph(rows, p.mask, scale, scale_pairs, widening, edges)
 
 
 def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScalePairs | None]:
@@ -174,8 +174,8 @@ def conclude(
     p: Problem, excluded: Int[Array, ""], graph: Graph, clique: Clique, settings: Settings,
     *, cascade: Run = find_cascade, run: Run = plainly,
 ) -> Solution:  # fmt: skip
-    """Find what lies behind the clique: the sets, the pose, and whether to trust it."""
-    p = widened(p, graph.widening)
+    """Find what lies behind the clique: the sets, the pose, and whether to trust it; in the user's rows."""
+    p = widened(in_rows(p, graph.rows), graph.widening)
     frozen, graph, clique = lax.stop_gradient((p, graph, clique))
     selection, settled = choose(frozen, graph, clique, settings, cascade=cascade, run=run)
     pose = run("refit", joint_pose if settings.refine else cascade_pose, p, selection)
@@ -183,7 +183,7 @@ def conclude(
         "verdict", judge, frozen, lax.stop_gradient(pose), selection, graph.edge_bits, settled, settings
     )
     size = jnp.sum(clique.members, dtype=jnp.int32)
-    return Solution(
+    found = Solution(
         pose=pose,
         selection=selection,
         inliers=selection.inliers,
@@ -194,6 +194,7 @@ def conclude(
         excluded=excluded,
         cost=truncated_cost(squared_residuals(pose, p.src, p.dst, p.noise_bound), p.mask, p.cbar2),
     )
+    return as_asked(found, graph.rows, has_pairs=p.pairs is not None)
 
 
 def judge(

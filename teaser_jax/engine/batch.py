@@ -16,14 +16,14 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Int
 
 from teaser_jax.engine.compaction import rows_for
-from teaser_jax.engine.frames import CentredStack, centred_stack, with_origins, without_padding
+from teaser_jax.engine.frames import Centred, centred, with_origins, without_padding
 from teaser_jax.engine.groups import by_shape, pack_list
-from teaser_jax.engine.packing import PackedProblem, hide_rows, in_rows, pack_problem, unpack
+from teaser_jax.engine.packing import PackedProblem, hide_rows, pack_problem, unpack
 from teaser_jax.engine.programs import Programs, device_kind, on_mesh, run_length, sharding_over
 from teaser_jax.engine.sizes import Size, size_of
 from teaser_jax.problem import Problem
 from teaser_jax.settings import Settings
-from teaser_jax.solution import Solution, as_asked
+from teaser_jax.solution import Solution
 from teaser_jax.solve import Graph
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import finish_on_host
@@ -100,7 +100,7 @@ def as_list(chunks: Iterator[Chunk], problems: list[Problem]) -> list[Solution]:
 class Run(NamedTuple):
     """Problems that went through the first program side by side, and what the devices hold of them."""
 
-    rows: Indices  # in the chunk
+    which: Indices  # in the chunk
     sent: PackedProblem
     graph: Graph
     clique: Clique
@@ -147,33 +147,31 @@ class Solver:
 
     def _solve(self, sent: PackedProblem, size: Size) -> Solution:
         """Solve packed problems of one size."""
-        sent, rows = in_rows(sent)
-        near = centred_stack(sent)
+        near = centred(sent)
         with jax.enable_x64(True):  # of this thread only
             runs, clique = self._find_cliques(near, size)
             solution = unpack(self._conclude(near.sent, runs, clique, size))
-        solution = as_asked(solution, rows, has_pairs=sent.pairs is not None)
         return solution if near.origins is None else with_origins(solution, *near.origins)
 
-    def _find_cliques(self, near: CentredStack, size: Size) -> tuple[list[Run], Clique]:
+    def _find_cliques(self, near: Centred, size: Size) -> tuple[list[Run], Clique]:
         """Send all problems through the first program, and search on the host what it leaves open."""
         length = self.run_length(size)
         runs = []
-        for rows, narrow in in_runs(near.narrow, length):
-            there = self._put(chosen_problems(near.sent, rows, length))
-            runs.append(Run(rows, there, *self._run(self.programs.before, there, narrow)))
-        searched = [self._search(run, near.sent) for run in runs]
+        for which, narrow in in_runs(near.narrow, length):
+            there = self._put(chosen_problems(near.sent, which, length))
+            runs.append(Run(which, there, *self._run(self.programs.before, there, narrow)))
+        searched = [self._search(run) for run in runs]
         runs = [run for run, _ in searched]
-        return runs, in_order([run.rows for run in runs], [clique for _, clique in searched])
+        return runs, in_order([run.which for run in runs], [clique for _, clique in searched])
 
-    def _search(self, run: Run, sent: PackedProblem) -> tuple[Run, Clique]:
+    def _search(self, run: Run) -> tuple[Run, Clique]:
         """Finish the cliques of a run; they are returned on the devices, and in numpy."""
-        count = len(run.rows)
+        count = len(run.which)
         clique, settled = first_of((run.clique, run.settled), count)
         if settled.all():
             return run, clique
-        edge_bits = first_of(run.graph.edge_bits, count)
-        clique = finish_on_host(self.settings.clique, edge_bits, sent.mask[run.rows], clique)
+        edge_bits, mask = first_of((run.graph.edge_bits, run.graph.mask), count)
+        clique = finish_on_host(self.settings.clique, edge_bits, mask, clique)
         everywhere = filled_up(clique, np.arange(count), len(run.sent.columns))
         return run._replace(clique=self._put(everywhere)), clique
 
@@ -182,18 +180,18 @@ class Solver:
         length = self.run_length(size)
         graph, answers = None, []
         chosen = in_runs(rows_for(size, self.settings, np.sum(clique.members, axis=1)), length)
-        for rows, few in chosen:
-            run = next((run for run in runs if np.array_equal(run.rows, rows)), None)
+        for which, few in chosen:
+            run = next((run for run in runs if np.array_equal(run.which, which)), None)
             if run is not None:
                 there = run.sent, run.graph, run.clique
             else:  # not as they went through the first: by way of the host
                 if graph is None:
-                    graphs = [first_of(run.graph, len(run.rows)) for run in runs]
-                    graph = in_order([run.rows for run in runs], graphs)
-                company = filled_up((graph, clique), rows, length)
-                there = self._put((chosen_problems(sent, rows, length), *company))
+                    graphs = [first_of(run.graph, len(run.which)) for run in runs]
+                    graph = in_order([run.which for run in runs], graphs)
+                company = filled_up((graph, clique), which, length)
+                there = self._put((chosen_problems(sent, which, length), *company))
             answers.append(self._run(self.programs.after, *there, few))
-        places = [rows for rows, _ in chosen]
+        places = [which for which, _ in chosen]
         return in_order(places, [first_of(x, len(k)) for k, x in zip(places, answers, strict=True)])
 
     # Threads that leave the order of transfers and programs on a GPU to JAX (0.11) now and then, once in some
@@ -215,12 +213,12 @@ class Solver:
 def in_runs(choice: np.ndarray, length: int) -> list[tuple[Indices, Any]]:
     """Group problems into runs, each with what was chosen for it: those that chose alike share runs."""
     alike = [(np.flatnonzero(choice == each), each.item()) for each in np.unique(choice)]
-    return [(rows[k : k + length], each) for rows, each in alike for k in range(0, len(rows), length)]
+    return [(which[k : k + length], each) for which, each in alike for k in range(0, len(which), length)]
 
 
-def in_order(rows: Sequence[Indices], parts: Sequence[Any]) -> Any:
+def in_order(which: Sequence[Indices], parts: Sequence[Any]) -> Any:
     """Join what the runs have found into one stack, in the order of the chunk."""
-    order = np.concatenate(rows)
+    order = np.concatenate(which)
     whole = jax.tree.map(lambda *x: np.concatenate(x), *parts)  # may be written to, as numpy's may
     if np.all(order[:-1] < order[1:]):
         return whole
@@ -233,17 +231,17 @@ def first_of(arrays: Any, count: int) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[:count], arrays)
 
 
-def chosen_problems(sent: PackedProblem, rows: Indices, length: int) -> PackedProblem:
-    """Take the problems of the given rows; what fills the run repeats the first, with its rows masked."""
-    filled = filled_up(sent, rows, length)
-    if len(rows) < length:
-        hide_rows(filled, len(rows))
+def chosen_problems(sent: PackedProblem, which: Indices, length: int) -> PackedProblem:
+    """Take the problems of the given places; what fills the run repeats the first, with its rows masked."""
+    filled = filled_up(sent, which, length)
+    if len(which) < length:
+        hide_rows(filled, len(which))
     return filled
 
 
-def filled_up(arrays: Any, rows: Indices, length: int) -> Any:
-    """Take the given rows of arrays; what fills the run repeats the first."""
-    if len(rows) == length == rows[-1] - rows[0] + 1:  # all in one piece: nothing is copied
-        return jax.tree.map(lambda x: x[rows[0] : rows[0] + length], arrays)
-    fill = np.append(rows, np.repeat(rows[:1], length - len(rows)))
+def filled_up(arrays: Any, which: Indices, length: int) -> Any:
+    """Take the given places of arrays; what fills the run repeats the first."""
+    if len(which) == length == which[-1] - which[0] + 1:  # all in one piece: nothing is copied
+        return jax.tree.map(lambda x: x[which[0] : which[0] + length], arrays)
+    fill = np.append(which, np.repeat(which[:1], length - len(which)))
     return jax.tree.map(lambda x: x[fill], arrays)

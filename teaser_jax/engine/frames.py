@@ -13,35 +13,9 @@ from teaser_jax.engine.packing import PackedProblem
 from teaser_jax.ground.bits import words
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
-from teaser_jax.reading import extent, finite_rows
 from teaser_jax.rows import Rows
 from teaser_jax.solution import Solution
 from teaser_jax.stages.consistency import margin_of
-
-
-class Centred(NamedTuple):
-    """A problem about the middles of its clouds, the origins taken away, and the type to test edges in."""
-
-    problem: Problem
-    src_origin: Float[np.ndarray, "3"]
-    dst_origin: Float[np.ndarray, "3"]
-    edge_dtype: type
-
-
-def centred(problem: Problem) -> Centred:
-    """Centre a problem about the middle of its usable points; numpy, one problem."""
-    usable = finite_rows(problem.src, problem.dst, problem.mask)
-    src, dst = problem.src[usable], problem.dst[usable]
-    if not len(src):
-        return Centred(problem, np.zeros(3), np.zeros(3), np.float64)
-    src_origin, dst_origin = middle(src), middle(dst)
-    near = replace(problem, src=problem.src - src_origin, dst=problem.dst - dst_origin)
-    dtype: type = np.float64  # a voted scale keeps all digits
-    if problem.scale is not None:
-        least = problem.noise_bound[usable].min()
-        extents = extent(near.src[usable]), extent(near.dst[usable])
-        dtype = np.float32 if float32_will_do(*extents, problem.scale, least, problem.cbar2) else np.float64
-    return Centred(near, src_origin, dst_origin, dtype)
 
 
 def middle(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
@@ -69,23 +43,30 @@ def float32_will_do(src_extent: Any, dst_extent: Any, scale: Any, least_bound: A
     return in_range & (margin_of(np.float32, reach) <= 1e-3 * bound)
 
 
-class CentredStack(NamedTuple):
-    """A packed stack in the frames in which it will be solved."""
+class Centred(NamedTuple):
+    """Packed problems in the frames in which they will be solved; one has arrays without an axis in front."""
 
     sent: PackedProblem
-    origins: tuple[Float[np.ndarray, "b 3"], Float[np.ndarray, "b 3"]] | None  # None: nothing was taken away
-    narrow: Bool[np.ndarray, " b"]  # whose edges float32 can test
+    origins: (
+        tuple[Float[np.ndarray, "*b 3"], Float[np.ndarray, "*b 3"]] | None
+    )  # None: nothing was taken away
+    narrow: Bool[np.ndarray, "*b"]  # whose edges float32 can test
+
+    @property
+    def edge_dtype(self) -> type:
+        """The type in which the edges of one problem are tested."""
+        return np.float32 if self.narrow else np.float64
 
 
-def centred_stack(sent: PackedProblem) -> CentredStack:
-    """Move points of a stack to their middle where float32 could not tell consistent matches otherwise.
+def centred(sent: PackedProblem) -> Centred:
+    """Move the points of a stack to their middle where float32 could not tell consistent matches otherwise.
 
     Most stacks of a study need nothing, and finding the middle takes a quarter of the time of solving
     a small problem.
     """
     narrow = _narrow(sent)
     if narrow.all():
-        return CentredStack(sent, None, narrow)
+        return Centred(sent, None, narrow)
     sent = replace(sent, columns=sent.columns.copy())
     origins = np.zeros((len(narrow), 3)), np.zeros((len(narrow), 3))
     for k in np.flatnonzero(~narrow):
@@ -94,7 +75,14 @@ def centred_stack(sent: PackedProblem) -> CentredStack:
             if usable.any():
                 origin[k] = middle(cloud[k][:, usable].T)
                 cloud[k] -= origin[k][:, None]
-    return CentredStack(sent, origins, _narrow(sent))
+    return Centred(sent, origins, _narrow(sent))
+
+
+def centred_one(sent: PackedProblem) -> Centred:
+    """Move the points of one packed problem, by the same rule."""
+    stack = centred(replace(sent, columns=sent.columns[None], numbers=sent.numbers[None]))
+    origins = None if stack.origins is None else (stack.origins[0][0], stack.origins[1][0])
+    return Centred(replace(sent, columns=stack.sent.columns[0]), origins, stack.narrow[0])
 
 
 def _narrow(sent: PackedProblem) -> Bool[np.ndarray, " b"]:

@@ -6,7 +6,7 @@ Whatever its size, each array that is sent or fetched takes as long as several s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int
 from teaser_jax.engine.sizes import Size
 from teaser_jax.ground.arrays import AnyArray, Placeholder
 from teaser_jax.problem import Problem
-from teaser_jax.rows import Rows, arrange_on_host
 from teaser_jax.settings import Settings
 
 ROWS = 9  # of the columns: three of the source, three of the target, then one each
@@ -96,19 +95,6 @@ def pack_problem(problem: Problem, settings: Settings, size: Size) -> PackedProb
 def hide_rows(packed: PackedProblem, first: int) -> None:
     """Mask all rows of the problems from ``first`` on, in place; numpy, a stack."""
     packed.columns[first:, MASK] = 0
-
-
-def in_rows(packed: PackedProblem) -> tuple[PackedProblem, Rows]:
-    """Put a stack of packed problems into their rows, copies masked; numpy."""
-    columns, pairs = packed.columns, packed.pairs
-    points, confidence = columns[..., :BOUND, :], columns[..., CONFIDENCE, :]
-    rows = arrange_on_host(points, packed.mask, packed.noise_bound, confidence)
-    columns = np.take_along_axis(columns, rows.order[..., None, :], axis=-1)
-    columns[..., MASK, :] *= np.take_along_axis(rows.alone, rows.order, axis=-1)
-    if pairs is not None:
-        flat = pairs.reshape(*pairs.shape[:-2], -1)
-        pairs = np.take_along_axis(rows.place, flat, axis=-1).reshape(pairs.shape)
-    return replace(packed, columns=columns, pairs=pairs), rows
 
 
 def unpack_problem(packed: PackedProblem) -> Problem:

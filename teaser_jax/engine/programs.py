@@ -48,23 +48,23 @@ def before_search(
     settings = unpack_settings(sent, choices)
     problem, _ = clean(unpack_problem(sent))
     graph = prepare(problem, settings, edge_dtype=edge_dtype)
-    found = settings.clique.on_device(graph.edge_bits, problem.mask)
+    found = settings.clique.on_device(graph.edge_bits, graph.mask)
     return graph, found, settings.clique.is_settled(found)
 
 
 def after_search(
-    sent: PackedProblem, graph: Graph, clique: Clique, choices: Any, rows: int = ALL_ROWS
+    sent: PackedProblem, graph: Graph, clique: Clique, choices: Any, few: int = ALL_ROWS
 ) -> Packed:
     """Run the second program: the sets, the pose, the verdict.
 
     Args:
         sent, choices: As for the first program.
         graph, clique: What the first program and the host have found.
-        rows: In how many rows rotation and translation are found; static.
+        few: In how many rows rotation and translation are found; static.
     """
     settings = unpack_settings(sent, choices)
     problem, excluded = clean(unpack_problem(sent))
-    return pack(conclude(problem, excluded, graph, clique, settings, cascade=cascade_in(rows)))
+    return pack(conclude(problem, excluded, graph, clique, settings, cascade=cascade_in(few)))
 
 
 class Programs(NamedTuple):
@@ -80,7 +80,7 @@ ON_ONE_DEVICE = Programs(
         static_argnames=("choices", "edge_dtype"),
         compiler_options=WHOLE_SUMS | WIDE_VECTORS,
     ),
-    jax.jit(after_search, static_argnames=("choices", "rows"), compiler_options=WHOLE_SUMS | OLDER_EMITTERS),
+    jax.jit(after_search, static_argnames=("choices", "few"), compiler_options=WHOLE_SUMS | OLDER_EMITTERS),
 )
 
 
@@ -126,11 +126,11 @@ def on_mesh(choices: Any, mesh: Mesh) -> Programs:
         dtype = np.float32 if narrow else np.float64
         return sharded(lambda one: before_search(one, choices, dtype), sent)
 
-    def after(sent: PackedProblem, graph: Graph, clique: Clique, rows: int) -> Any:
-        return sharded(lambda s, g, c: after_search(s, g, c, choices, rows), sent, graph, clique)
+    def after(sent: PackedProblem, graph: Graph, clique: Clique, few: int) -> Any:
+        return sharded(lambda s, g, c: after_search(s, g, c, choices, few), sent, graph, clique)
 
     options = WHOLE_SUMS | WIDE_VECTORS if on_cpu else UNTIMED_KERNELS if on_gpu else {}
     return Programs(
         jax.jit(before, static_argnames="narrow", compiler_options=options),
-        jax.jit(after, static_argnames="rows", compiler_options=options),
+        jax.jit(after, static_argnames="few", compiler_options=options),
     )

@@ -102,8 +102,7 @@ def evidence_of(
     """
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
-    points = [within & ~repeats(x, within) for x in (problem.src, problem.dst)]
-    distinct = jnp.minimum(*(jnp.sum(x, dtype=jnp.int32) for x in points))
+    distinct = jnp.minimum(*(count_distinct(x, within) for x in (problem.src, problem.dst)))
     alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits), distinct)
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
@@ -159,19 +158,16 @@ def explained_by_reflection(problem: Problem, clique: Bool[Array, " n"]) -> Int[
     return jnp.sum(clique & (r2 <= problem.cbar2), dtype=jnp.int32)
 
 
-def repeats(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> Bool[Array, " n"]:
-    """Tell which points are exact copies of an earlier chosen one.
+def count_distinct(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> Int[Array, ""]:
+    """Count the chosen points, exact copies once.
 
-    Each is sent to a slot by a hash of its coordinates, and compared with the first one that came there. Two
-    different points in one slot hide copies from each other: one in sixteen at most.
+    Each is sent to a slot by a hash of its coordinates. Two different points in one slot count as one: of few
+    hardly ever, of all one in eight.
     """
-    n = points.shape[0]
-    if n == 0:
-        return jnp.zeros(0, bool)
-    width, index = max(4, (16 * n - 1).bit_length()), jnp.arange(n, dtype=jnp.int32)
+    width = max(12, (4 * points.shape[0]).bit_length())
     slot = (keys(points.T) >> (31 - width)).astype(jnp.int32)
-    first = jnp.full(1 << width, n - 1, jnp.int32).at[slot].min(jnp.where(chosen, index, n - 1))[slot]
-    return (first < index) & jnp.all(points == points[first], axis=1)
+    taken = jnp.zeros(1 << width, bool).at[jnp.where(chosen, slot, 1 << width)].set(True, mode="drop")
+    return jnp.sum(taken, dtype=jnp.int32)
 
 
 def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:
