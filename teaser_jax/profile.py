@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from teaser_jax.agreement import prepare
 from teaser_jax.engine.frames import centred_one, with_origins, without_padding
 from teaser_jax.engine.packing import pack_problem, unpack_problem
 from teaser_jax.engine.sizes import size_of
@@ -19,7 +20,7 @@ from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import clean, host_problem
 from teaser_jax.register import INSIDE_JIT, Registration
 from teaser_jax.settings import Settings, check_settings
-from teaser_jax.solve import conclude, prepare
+from teaser_jax.solve import conclude
 from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
 
 

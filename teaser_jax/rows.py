@@ -54,15 +54,17 @@ def arrange(problem: Problem) -> Rows:
     index, points = jnp.arange(n, dtype=jnp.int32), jnp.concatenate([p.src.T, p.dst.T])
     with jax.enable_x64(True):  # one number to sort by is four times as fast as two
         key = jnp.where(p.mask, keys(points), LAST).astype(jnp.uint64) << 32
-        order = (lax.sort(key | index.astype(jnp.uint64)) & LAST.astype(np.uint64)).astype(jnp.int32)
-    here, usable = points[:, order], p.mask[order]
-    copy = jnp.all(here[:, 1:] == here[:, :-1], axis=0) & usable[1:] & usable[:-1]
-    leads = jnp.pad(~copy, (1, 0), constant_values=True)
+        ordered = lax.sort(key | index.astype(jnp.uint64))
+        order, key = (ordered & LAST.astype(np.uint64)).astype(jnp.int32), (ordered >> 32).astype(jnp.uint32)
+    alike = (key[1:] == key[:-1]) & (key[1:] != LAST)
 
     def without_copies() -> Rows:  # nearly always
         return Rows(order, jnp.zeros_like(index).at[order].set(index))
 
     def with_copies() -> Rows:
+        here = points[:, order]
+        copy = alike & jnp.all(here[:, 1:] == here[:, :-1], axis=0)
+        leads = jnp.pad(~copy, (1, 0), constant_values=True)
         place = jnp.zeros_like(index).at[order].set(bits.listed(leads)[bits.rank(leads) - 1])
         # Of copies the most confident one stands for all, and of those one with the smallest bound.
         best = jnp.zeros_like(p.confidence).at[place].max(p.confidence)
@@ -71,7 +73,7 @@ def arrange(problem: Problem) -> Rows:
         winner = jnp.full(n, n - 1, jnp.int32).at[place].min(jnp.where(doubt == least[place], index, n - 1))
         return Rows(jnp.where(leads, winner, order), place)
 
-    return lax.cond(jnp.any(copy), with_copies, without_copies)
+    return lax.cond(jnp.any(alike), with_copies, without_copies)
 
 
 def keys(points: Float[Array, "k n"]) -> UInt32[Array, " n"]:

@@ -13,38 +13,25 @@ the host, and ``profile`` times them one by one: a stage is run by ``run``, whic
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
+from teaser_jax.agreement import Graph, prepare
 from teaser_jax.cascade import find_cascade
 from teaser_jax.ground.steps import Run, plainly
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, check_precision, clean
 from teaser_jax.refit import cascade_pose, check_problem, joint_pose, widened
-from teaser_jax.rows import Rows, arrange, in_rows
+from teaser_jax.rows import in_rows
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Selection, Solution, as_asked, with_rows
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import maximum_clique
-from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.refinement import Refinement, refine, squared_residuals, truncated_cost
-from teaser_jax.stages.scale import ScalePairs, estimate_scale
 from teaser_jax.stages.verdict import evidence_of, status_of
-from teaser_jax.stages.widening import bound_widening
-
-
-class Graph(NamedTuple):
-    """What is known before the clique: where the rows are, and which; the scale; the bounds; who agrees."""
-
-    rows: Rows
-    mask: Bool[Array, " n"]
-    scale: Float[Array, ""]
-    scale_pairs: ScalePairs | None
-    widening: Float[Array, ""]
-    edge_bits: UInt32[Array, "n w"]
 
 
 def solve(problem: Problem, settings: Settings = Settings()) -> Solution:
@@ -103,41 +90,6 @@ def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Int[Array, ""]]:
     check_settings(settings)
     check_precision(problem)
     return clean(problem)
-
-
-def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
-    """Find the scale and the consistency graph of a clean problem; edges are tested in ``edge_dtype``."""
-    rows = run("rows", arrange, p)
-    p = in_rows(p, rows)
-    scale, scale_pairs = run("scale", find_scale, p, settings)
-    widening = run("widening", find_widening, p, scale, settings)
-    edges = run("consistency graph", find_edges, widened(p, widening), scale, dtype=edge_dtype)
-    return Graph(rows, p.mask, scale, scale_pairs, widening, edges)
-
-
-def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScalePairs | None]:
-    """Return the known scale, or find it by the vote (11), with the pairs that agree with it."""
-    if p.scale is not None:
-        return p.scale, None
-    return estimate_scale(
-        p.src, p.dst, p.noise_bound, p.mask,
-        cbar2=p.cbar2, pairs=p.pairs, criterion=settings.vote, scale_range=settings.scale_search.range,
-    )  # fmt: skip
-
-
-def find_widening(p: Problem, scale: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
-    """Find by how much bounds are wider than asked for; the plain cascade takes them as they are."""
-    if settings.refine is None:
-        return jnp.ones_like(p.cbar2)
-    return bound_widening(p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs)
-
-
-def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> UInt32[Array, "n w"]:
-    """Find the consistency graph at a scale, tested in ``dtype`` (None: that of the problem)."""
-    src, dst, noise_bound, scale, cbar2 = (
-        x.astype(dtype or p.src.dtype) for x in (p.src, p.dst, p.noise_bound, scale, p.cbar2)
-    )
-    return consistency_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
 
 
 def choose(

@@ -25,7 +25,7 @@ ORDER = [
     "stages.rotation.pair_search",
     "stages.rotation.relaxation", "stages.rotation.robust",
     "stages.translation", "stages.refinement", "stages.verdict",
-    "settings", "refit", "cascade", "solve", "soft", "uncertainty",
+    "settings", "refit", "agreement", "cascade", "solve", "soft", "uncertainty",
     "engine.compiler", "engine.sizes", "engine.packing", "engine.frames", "engine.compaction",
     "engine.programs", "engine.single",
     "engine.groups", "engine.processes", "engine.batch",

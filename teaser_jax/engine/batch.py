@@ -15,6 +15,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Int
 
+from teaser_jax.agreement import Graph
 from teaser_jax.engine.compaction import rows_for
 from teaser_jax.engine.frames import Centred, centred, with_origins, without_padding
 from teaser_jax.engine.groups import by_shape, pack_list
@@ -24,7 +25,6 @@ from teaser_jax.engine.sizes import Size, size_of
 from teaser_jax.problem import Problem
 from teaser_jax.settings import Settings
 from teaser_jax.solution import Solution
-from teaser_jax.solve import Graph
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import finish_on_host
 

@@ -15,12 +15,13 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool
 
+from teaser_jax.agreement import Graph, prepare
 from teaser_jax.engine.compaction import ALL_ROWS, cascade_in
 from teaser_jax.engine.compiler import OLDER_EMITTERS, UNTIMED_KERNELS, WHOLE_SUMS, WIDE_VECTORS
 from teaser_jax.engine.packing import Packed, PackedProblem, pack, unpack_problem, unpack_settings
 from teaser_jax.engine.sizes import Size
 from teaser_jax.problem import clean
-from teaser_jax.solve import Graph, conclude, prepare
+from teaser_jax.solve import conclude
 from teaser_jax.stages.clique.clique import Clique
 
 AXIS = "problems"
