@@ -62,16 +62,20 @@ def arrange(problem: Problem) -> Rows:
         return Rows(order, jnp.zeros_like(index).at[order].set(index))
 
     def with_copies() -> Rows:
-        here = points[:, order]
-        copy = alike & jnp.all(here[:, 1:] == here[:, :-1], axis=0)
-        leads = jnp.pad(~copy, (1, 0), constant_values=True)
-        place = jnp.zeros_like(index).at[order].set(bits.listed(leads)[bits.rank(leads) - 1])
+        here, usable = points[:, order], key != LAST
+        copy = jnp.pad(alike & jnp.all(here[:, 1:] == here[:, :-1], axis=0), (1, 0))
+        leads = usable & ~copy
+        count = jnp.sum(leads, dtype=jnp.int32)
+        place = jnp.zeros_like(index).at[order].set(jnp.where(usable, bits.rank(leads) - 1, index))
         # Of copies the most confident one stands for all, and of those one with the smallest bound.
         best = jnp.zeros_like(p.confidence).at[place].max(p.confidence)
         doubt = jnp.where(p.confidence == best[place], p.noise_bound, jnp.inf)
         least = jnp.full_like(doubt, jnp.inf).at[place].min(doubt)
         winner = jnp.full(n, n - 1, jnp.int32).at[place].min(jnp.where(doubt == least[place], index, n - 1))
-        return Rows(jnp.where(leads, winner, order), place)
+        # Then the copies, which nobody will look at.
+        last = jnp.where(copy, count + bits.rank(copy) - 1, index)
+        rest = order.at[jnp.where(leads, n, last)].set(order, mode="drop")
+        return Rows(jnp.where(index < count, winner, rest), place)
 
     return lax.cond(jnp.any(alike), with_copies, without_copies)
 

@@ -184,7 +184,7 @@ def test_the_lower_of_two_ends_counts():
     differ = 0
     for seed in range(12):
         matches = random_matches(seed, N, wrong=0.3, noise_bound=0.3)
-        bounds, mask = np.full(N, 0.2), np.ones(N, bool)
+        bounds, mask = np.full(N, 0.25), np.ones(N, bool)
         rng = np.random.default_rng(seed)
         start = tj.Pose(np.eye(3), 0.05 * rng.normal(size=3), ONE) @ matches.truth
         residuals = joint_residuals(start, matches.src, matches.dst, bounds)

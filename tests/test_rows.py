@@ -63,6 +63,8 @@ def test_of_copies_the_most_confident_stands_for_all(seed, x64):
     """And of those the one with the smallest bound; whoever stands for them all is found in numpy."""
     problem = with_copies(seed)
     rows = jax.device_get(ARRANGE(problem))
+    used = np.asarray(PUT(problem, rows).mask)
+    assert used[: used.sum()].all()  # copies and masked rows come last
     points = np.concatenate([problem.src, problem.dst], axis=1)
     for k in np.flatnonzero(problem.mask):
         copies = np.flatnonzero((points == points[k]).all(axis=1) & problem.mask)
@@ -132,7 +134,7 @@ def test_a_row_listed_two_hundred_times_is_one_match(what, scale):
         for ask in (tj.certify, tj.covariance):
             for x, y in zip(jax.tree.leaves(ask(result)), jax.tree.leaves(ask(alone)), strict=True):
                 if np.ndim(x) < 3 and np.shape(x) == np.shape(y):
-                    np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-9)
+                    np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-9)
     refitted = tj.refit(result.problem, result.solution.selection)
     np.testing.assert_allclose(refitted.matrix, result.pose.matrix, atol=1e-12)
 

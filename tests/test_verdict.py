@@ -194,13 +194,14 @@ def test_a_pose_that_two_matches_hold_is_not_determined():
 def test_a_scale_out_of_its_range_has_no_consensus():
     problem = random_problem(0, n=60, outlier_rate=0.5)
     known = dict(noise_bound=problem.noise_bound, scale=None)
+    by_chance = {tj.Status.NO_CONSENSUS, tj.Status.DEGENERATE}  # so few agree that they may lie on a line
     for scale_range, expected in {
-        (0.9, 1.1): tj.Status.OK,
-        (1.2, 1.5): tj.Status.NO_CONSENSUS,
-        (2.0, 3.0): tj.Status.NO_CONSENSUS,
+        (0.9, 1.1): {tj.Status.OK},
+        (1.2, 1.5): {tj.Status.NO_CONSENSUS},
+        (2.0, 3.0): by_chance,
     }.items():
         settings = tj.Settings(scale_search=ScaleVote(scale_range))
-        assert status(problem.src, problem.dst, settings=settings, **known) == expected
+        assert status(problem.src, problem.dst, settings=settings, **known) in expected
 
 
 @pytest.mark.long
