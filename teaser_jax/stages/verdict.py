@@ -103,7 +103,7 @@ def evidence_of(
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
     distinct = jnp.minimum(*(count_distinct(x, within) for x in (problem.src, problem.dst)))
-    alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits), distinct)
+    alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits))
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
     by_reflection = explained_by_reflection(problem, clique)
@@ -193,9 +193,8 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
 
 
 def log_false_alarms(
-    problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"],
-    distinct: Int[Array, ""],
-) -> Float[Array, ""]:  # fmt: skip
+    problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"]
+) -> Float[Array, ""]:
     """Estimate the log of the expected number of poses with as many inliers if all matches were wrong.
 
     Three matches that agree on their distances make a pose; the rest of its inliers must come by
@@ -213,7 +212,7 @@ def log_false_alarms(
     mean = (jnp.sum(counts) + 1) / len(TURNS)
     excess = jnp.maximum(jnp.mean((counts - mean) ** 2) - mean, 1e-3 * mean)
     shape = mean**2 / excess
-    further = jnp.maximum(distinct - 3, 0).astype(dtype)
+    further = jnp.maximum(jnp.sum(inliers, dtype=jnp.int32) - 3, 0).astype(dtype)
     tail = xlogy(further, further / mean) - (further + shape) * jnp.log((further + shape) / (mean + shape))
     tail = jnp.where(further > mean, tail, 0)
     degree = degrees.astype(dtype)
