@@ -23,7 +23,7 @@ from teaser_jax.ground.checks import whole_number
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, check_precision, clean
-from teaser_jax.refit import check_problem
+from teaser_jax.refit import as_judged, check_problem
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Solution, Status
 from teaser_jax.solve import solve
@@ -81,9 +81,9 @@ def soft_solve(
 ) -> SoftSolution:
     """Find the stationary point of the GNC-TLS cost at a fixed control, next to the answer of ``solve``.
 
-    Minimises sum_i confidence_i rho_mu(|b_i - s R a_i - t|^2 / beta_i^2) over all matches and all
-    unknowns, by reweighted similarity fits, none of which can raise the cost. Works under jit, vmap and
-    grad; follows the dtype of the problem.
+    Minimises sum_i confidence_i rho_mu(|b_i - s R a_i - t|^2 / beta_i^2) over all matches, exact copies
+    counted once, and all unknowns, with the widened bounds of that answer; by reweighted similarity fits,
+    none of which can raise the cost. Works under jit, vmap and grad; follows the dtype of the problem.
 
     Args:
         problem: From ``make_problem``.
@@ -116,12 +116,14 @@ def soft_solve(
         raise ValueError(f"gnc_mu is {gnc_mu}: expected one finite number above 0.")
     whole_number("iterations", iterations, 1)
     start = solve(lax.stop_gradient(problem), lax.stop_gradient(settings))
-    p, _ = clean(problem)
+    usable, _ = clean(problem)
+    p = as_judged(usable, start.selection)
+    confidence = jnp.where(p.mask, p.confidence, 0)
     dtype = p.src.dtype
     mu = jnp.asarray(gnc_mu, dtype)
     sensible = jnp.isfinite(mu) & (mu > 0)
     data = _Data(
-        p.src, p.dst, p.noise_bound, p.confidence, p.cbar2, jnp.where(sensible, mu, 1), p.scale
+        p.src, p.dst, p.noise_bound, confidence, p.cbar2, jnp.where(sensible, mu, 1), p.scale
     )  # fmt: skip
     pose, settled, determined = _stationary(data, start.pose, iterations)
     r2 = squared_residuals(pose, p.src, p.dst, p.noise_bound)
@@ -129,9 +131,9 @@ def soft_solve(
     status = jnp.where(determined, status, Status.DEGENERATE)
     return SoftSolution(
         pose=pose,
-        weights=jnp.where(p.mask, gnc_weights(r2, data.gnc_mu, p.cbar2), 0),
+        weights=jnp.where(usable.mask, gnc_weights(r2, data.gnc_mu, p.cbar2), 0),
         status=jnp.where(start.status == Status.OK, status, start.status).astype(jnp.int32),
-        cost=jnp.sum(p.confidence * gnc_cost(r2, data.gnc_mu, p.cbar2)),
+        cost=jnp.sum(confidence * gnc_cost(r2, data.gnc_mu, p.cbar2)),
         solution=start,
     )
 

@@ -154,12 +154,8 @@ def judge(
     settings: Settings,
 ) -> Int[Array, ""]:  # fmt: skip
     """Decide the status of a pose, from what speaks for it and against it."""
-    inliers = within = selection.inliers
-    if settings.refine:
-        p = widened(p, 1 / selection.widening)  # the bounds as given
-        within &= squared_residuals(pose, p.src, p.dst, p.noise_bound) <= p.cbar2
     evidence = evidence_of(
-        p, pose, inliers, within, selection.clique, edge_bits,
+        p, pose, selection.inliers, selection.clique, edge_bits,
         has_settled=settled, pruned=settings.clique.prunes, scale_range=settings.scale_search.range,
     )  # fmt: skip
     return status_of(evidence)

@@ -124,7 +124,7 @@ def test_the_flattest_four_is_exact():
 def test_the_bounds_of_the_paper_and_their_reasons():
     _, result = registered(0, 100, 0.5)
     bounds = tj.error_bounds(result.problem, result.solution)
-    beta = float(result.problem.noise_bound[0])
+    beta = float(result.problem.noise_bound[0] * result.solution.selection.widening)
     assert_allclose(bounds.translation.value, (9 + 3 * np.sqrt(3)) * beta)
     assert bounds.scale.value == 0  # known
     assert not bounds.matrix.informative

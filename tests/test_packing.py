@@ -77,4 +77,4 @@ def test_a_leaf_that_stands_in_a_record_twice_travels_once(x64):
     problem = tj.make_problem(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
     sent = jax.jit(lambda p: pack(tj.solve(p)))(problem)
     assert [mask.shape for mask in sent.masks] == [(32, 6)]
-    assert not sent.others
+    assert [x.shape for x in sent.others] == [(32,), (32,)]  # the order of the rows, and back

@@ -70,7 +70,8 @@ def test_right_matches_are_found(scale, x64):
         assert pose_error(solution.pose, matches.truth) < 0.1
         assert not np.any(solution.inliers & ~matches.inliers)
         assert np.mean(np.asarray(solution.inliers)[matches.inliers]) > 0.7
-        agree = joint_residuals(solution.pose, matches.src, matches.dst, matches.noise_bound) <= 1
+        bound = matches.noise_bound * float(solution.selection.widening)
+        agree = joint_residuals(solution.pose, matches.src, matches.dst, bound) <= 1
         np.testing.assert_array_equal(solution.inliers, agree)
         assert int(solution.clique_size) >= matches.inliers.sum()
         assert bool(solution.clique_is_maximum)

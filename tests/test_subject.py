@@ -33,12 +33,14 @@ def test_a_chain_is_closed(solved):
     assert subject.mask.sum() == solved.solution.clique_size
     for vectors in existing(subject):
         assert_allclose(vectors.sum(axis=0), 0, atol=1e-12)
-    assert_allclose(subject.noise_bound[subject.mask], 2 * solved.problem.noise_bound[0])
+    bound = solved.problem.noise_bound[0] * solved.solution.selection.widening
+    assert_allclose(subject.noise_bound[subject.mask], 2 * bound)
 
 
 @pytest.mark.long
 def test_the_complete_graph_has_all_pairs_of_the_clique(solved):
-    members = np.flatnonzero(solved.solution.selection.clique)
+    chosen = solved.solution.selection
+    members = chosen.rows.order[chosen.clique[chosen.rows.order]]  # in the order in which they were solved
     src, _ = existing(subject_on_host(solved.problem, solved.solution, "complete"))
     i, j = np.triu_indices(len(members), 1)
     points = solved.problem.src[members]

@@ -77,7 +77,6 @@ def evidence_of(
     problem: Problem,
     pose: Pose,
     inliers: Bool[Array, " n"],
-    within: Bool[Array, " n"],
     clique: Bool[Array, " n"],
     edge_bits: UInt32[Array, "n w"],
     *,
@@ -88,10 +87,9 @@ def evidence_of(
     """Collect what speaks for a pose and against it.
 
     Args:
-        problem: Clean, with the bounds as given: wider ones are met more easily by chance.
+        problem: Clean.
         pose: The candidate, from the source to the target frame.
         inliers: The matches that it explains.
-        within: Those of them that it explains within the bounds as given.
         clique: The clique it came from.
         edge_bits: The consistency graph.
         has_settled: Whether every iteration settled.
@@ -102,12 +100,12 @@ def evidence_of(
     """
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
-    distinct = jnp.minimum(*(count_distinct(x, within) for x in (problem.src, problem.dst)))
-    alarms = log_false_alarms(problem, pose, within, bits.count(edge_bits))
+    distinct = jnp.minimum(*(count_distinct(x, inliers) for x in (problem.src, problem.dst)))
+    alarms = log_false_alarms(problem, pose, inliers, bits.count(edge_bits))
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
     by_reflection = explained_by_reflection(problem, clique)
-    by_pose = jnp.sum(clique & within, dtype=jnp.int32)
+    by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
     low, high = scale_range
     outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
     return Evidence(

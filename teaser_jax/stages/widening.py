@@ -34,8 +34,8 @@ def bound_widening(
 ) -> Float[Array, ""]:
     """Find by how much to widen the bounds: 1 + 1.5 / sqrt(m), for about m right matches.
 
-    m is the largest number of matches that agree with one of the first 32: at least the right ones, where
-    there is one of them. Of given pairs it is estimated from the share that agrees.
+    m is the largest number of matches that agree with one of 32: at least the right ones, where there is
+    one of them. Of given pairs it is estimated from the share that agrees.
 
     Args:
         src, dst: Clean matches, row i with row i [length].
@@ -53,10 +53,10 @@ def bound_widening(
     src, dst, noise_bound, scale, cbar2 = lax.stop_gradient((src, dst, noise_bound, scale, cbar2))
     scaled, reach = scale * src, jnp.sqrt(cbar2) * noise_bound
     if pairs is None:
-        first = slice(0, min(src.shape[0], PIVOTS))
-        a2, b2 = (sum((x[first, None, k] - x[None, :, k]) ** 2 for k in range(3)) for x in (scaled, dst))
-        agree = lengths_agree(jnp.asarray(a2), jnp.asarray(b2), reach[first, None] + reach[None])
-        agree &= mask[first, None] & mask[None]
+        pivots = _spread(mask)
+        a2, b2 = (sum((x[pivots, None, k] - x[None, :, k]) ** 2 for k in range(3)) for x in (scaled, dst))
+        agree = lengths_agree(jnp.asarray(a2), jnp.asarray(b2), reach[pivots, None] + reach[None])
+        agree &= mask[pivots, None] & mask[None]
         right = jnp.max(jnp.sum(agree, axis=1, dtype=jnp.int32), initial=0).astype(src.dtype)
     else:
         usable = usable_pairs(pairs, mask)
@@ -65,3 +65,11 @@ def bound_widening(
         counts = [jnp.sum(x, dtype=jnp.int32).astype(src.dtype) for x in (agree, usable, mask)]
         right = counts[2] * jnp.sqrt(counts[0] / jnp.maximum(counts[1], 1))
     return 1 + SHARE / jnp.sqrt(jnp.maximum(right, FEWEST))
+
+
+def _spread(mask: Bool[Array, " n"]) -> Int[Array, " k"]:
+    """Choose rows all over those that can be used, which come first."""
+    n = mask.shape[0]
+    count, most = jnp.sum(mask, dtype=jnp.int32), min(n, PIVOTS)
+    # A product with n would not fit into 32 bits for millions of rows.
+    return jnp.minimum((jnp.arange(most, dtype=jnp.float32) * (count / most)).astype(jnp.int32), n - 1)
