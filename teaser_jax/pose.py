@@ -29,6 +29,13 @@ class Pose:
     translation: Float[AnyArray, "... 3"] | Float[AnyArray, "3 ..."] | Placeholder
     scale: Float[AnyArray, "..."] | Placeholder
 
+    def __post_init__(self) -> None:
+        """Take plain numbers and lists, too: Pose(rotation, [1, 2, 3], 1)."""
+        for name in ("rotation", "translation", "scale"):
+            value = getattr(self, name)
+            if isinstance(value, (int, float, list, tuple)) and not isinstance(value, np.floating):
+                object.__setattr__(self, name, np.asarray(value, np.float64))
+
     @classmethod
     def from_matrix(cls, matrix: Any) -> Pose:
         """Make a pose from ``[s R, t; 0, 1]``. Raises ValueError if a concrete s R is no scaled rotation."""

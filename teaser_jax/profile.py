@@ -82,7 +82,8 @@ def profile(
         graph = prepare(p, settings, edge_dtype=near.edge_dtype, run=timed)
         found = timed("clique, device", search_on_device, settings.clique, graph.edge_bits, graph.mask)
         clique = timed("clique, host", finish_on_host, settings.clique, graph.edge_bits, graph.mask, found)
-        solution = jax.device_get(conclude(p, excluded, graph, clique, settings, run=timed))
+        found = conclude(p, excluded, graph, clique, settings, offset=near.sent.offset, run=timed)
+        solution = jax.device_get(found)
     solution = without_padding(solution, problem)
     if near.origins is not None:
         solution = with_origins(solution, *near.origins)

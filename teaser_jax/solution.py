@@ -26,6 +26,7 @@ class Status(enum.IntEnum):
     DEGENERATE = 3
     NOT_CONVERGED = 5  # 4 is kept for answers that have a rival
     MIRRORED = 6
+    BY_POSITION = 7
 
     @property
     def advice(self) -> str:
@@ -53,6 +54,11 @@ _ADVICE = {
     Status.MIRRORED: (
         "The clouds are mirror images: the matches agree pairwise, and a reflection explains them where no "
         "rotation does. One of them is left-handed: flip any one axis of it, or swap two."
+    ),
+    Status.BY_POSITION: (
+        "The matches join nearest neighbours in the frames as given, also those that the pose leaves out. "
+        "Matches made by position cannot tell a small motion from none, so even aligned clouds are refused: "
+        "start from matches of descriptors."
     ),
     Status.NOT_CONVERGED: (
         "An iteration cap was reached before the inliers settled: raise the iterations of Gnc or of "

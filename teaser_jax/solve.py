@@ -17,7 +17,7 @@ from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.agreement import Graph, prepare
 from teaser_jax.cascade import find_cascade
@@ -124,18 +124,20 @@ def find_inliers(
 
 def conclude(
     p: Problem, excluded: Int[Array, ""], graph: Graph, clique: Clique, settings: Settings,
-    *, cascade: Run = find_cascade, run: Run = plainly,
+    *, offset: Float[Array, "3"] | None = None, cascade: Run = find_cascade, run: Run = plainly,
 ) -> Solution:  # fmt: skip
-    """Find what lies behind the clique: the sets, the pose, and whether to trust it; in the user's rows."""
+    """Find what lies behind the clique: the sets, the pose, and whether to trust it; in the user's rows.
+
+    Added to the source, ``offset`` makes it stand to the target as in the frames as given; None: it does.
+    """
     p = widened(in_rows(p, graph.rows), graph.widening)
     frozen, graph, clique = lax.stop_gradient((p, graph, clique))
     selection, settled = choose(frozen, graph, clique, settings, cascade=cascade, run=run)
     pose = run("refit", joint_pose if settings.refine else cascade_pose, p, selection)
-    status = run(
-        "verdict", judge, frozen, lax.stop_gradient(pose), selection, graph.edge_bits, settled, settings
-    )
+    found = lax.stop_gradient(pose)
+    status = run("verdict", judge, frozen, found, selection, graph.edge_bits, settled, settings, offset)
     size = jnp.sum(clique.members, dtype=jnp.int32)
-    found = Solution(
+    solution = Solution(
         pose=pose,
         selection=selection,
         inliers=selection.inliers,
@@ -146,16 +148,17 @@ def conclude(
         excluded=excluded,
         cost=truncated_cost(squared_residuals(pose, p.src, p.dst, p.noise_bound), p.mask, p.cbar2),
     )
-    return as_asked(found, graph.rows, has_pairs=p.pairs is not None)
+    return as_asked(solution, graph.rows, has_pairs=p.pairs is not None)
 
 
 def judge(
     p: Problem, pose: Pose, selection: Selection, edge_bits: UInt32[Array, "n w"], settled: Bool[Array, ""],
-    settings: Settings,
+    settings: Settings, offset: Float[Array, "3"] | None,
 ) -> Int[Array, ""]:  # fmt: skip
     """Decide the status of a pose, from what speaks for it and against it."""
     evidence = evidence_of(
         p, pose, selection.inliers, selection.clique, edge_bits,
         has_settled=settled, pruned=settings.clique.prunes, scale_range=settings.scale_search.range,
+        offset=offset,
     )  # fmt: skip
     return status_of(evidence)

@@ -24,7 +24,7 @@ ORDER = [
     "stages.rotation.tims", "stages.rotation.gnc", "stages.rotation.quadratic_form",
     "stages.rotation.pair_search",
     "stages.rotation.relaxation", "stages.rotation.robust",
-    "stages.translation", "stages.refinement", "stages.verdict",
+    "stages.translation", "stages.refinement", "stages.position", "stages.verdict",
     "settings", "refit", "agreement", "cascade", "solve", "soft", "uncertainty",
     "engine.compiler", "engine.sizes", "engine.packing", "engine.frames", "engine.compaction",
     "engine.programs", "engine.single",

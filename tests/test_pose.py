@@ -72,3 +72,9 @@ def test_what_is_no_pose_is_named(two, value, said, tmp_path):
 
 def test_whole_numbers_make_a_pose():
     assert Pose.from_matrix(np.eye(4, dtype=int)).translation.dtype == np.float64
+
+
+def test_plain_numbers_make_a_pose():
+    pose = tj.Pose(np.eye(3).tolist(), (1, 2, 3), 2)
+    np.testing.assert_array_equal(pose.apply([[1, 1, 1]]), [[3, 4, 5]])
+    np.testing.assert_array_equal((pose @ pose.inverse()).matrix, np.eye(4))

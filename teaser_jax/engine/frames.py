@@ -67,7 +67,7 @@ def centred(sent: PackedProblem) -> Centred:
     narrow = _narrow(sent)
     if narrow.all():
         return Centred(sent, None, narrow)
-    sent = replace(sent, columns=sent.columns.copy())
+    sent = replace(sent, columns=sent.columns.copy(), numbers=sent.numbers.copy())
     origins = np.zeros((len(narrow), 3)), np.zeros((len(narrow), 3))
     for k in np.flatnonzero(~narrow):
         usable = sent.usable[k]
@@ -75,6 +75,7 @@ def centred(sent: PackedProblem) -> Centred:
             if usable.any():
                 origin[k] = middle(cloud[k][:, usable].T)
                 cloud[k] -= origin[k][:, None]
+    sent.offset[...] = origins[0] - origins[1]
     return Centred(sent, origins, _narrow(sent))
 
 
@@ -82,7 +83,8 @@ def centred_one(sent: PackedProblem) -> Centred:
     """Move the points of one packed problem, by the same rule."""
     stack = centred(replace(sent, columns=sent.columns[None], numbers=sent.numbers[None]))
     origins = None if stack.origins is None else (stack.origins[0][0], stack.origins[1][0])
-    return Centred(replace(sent, columns=stack.sent.columns[0]), origins, stack.narrow[0])
+    one = replace(sent, columns=stack.sent.columns[0], numbers=stack.sent.numbers[0])
+    return Centred(one, origins, stack.narrow[0])
 
 
 def _narrow(sent: PackedProblem) -> Bool[np.ndarray, " b"]:

@@ -21,6 +21,7 @@ from teaser_jax.settings import Settings
 
 ROWS = 9  # of the columns: three of the source, three of the target, then one each
 BOUND, CONFIDENCE, MASK = 6, 7, 8
+OFFSET, SETTINGS = slice(2, 5), 5  # of the numbers
 MOST_NUMBERS = 16  # entries of a leaf that travels among the numbers
 
 
@@ -31,7 +32,8 @@ class PackedProblem:
 
     Attributes:
         columns: Source, target, bounds, confidences and mask, each in one piece.
-        numbers: cbar2, the scale (1 where it is not known), and the numbers of the settings.
+        numbers: cbar2, the scale (1 where it is not known), how far the frames were moved against each
+            other, and the numbers of the settings.
         pairs: Given pairs, padded with (0, 0).
         scale_is_known: Whether the scale is one of the numbers; static.
     """
@@ -67,6 +69,11 @@ class PackedProblem:
         return self.numbers[..., 0]
 
     @property
+    def offset(self) -> Float[AnyArray, "*batch 3"]:
+        """What to add to the source to make it stand to the target as in the frames as given."""
+        return self.numbers[..., OFFSET]
+
+    @property
     def scale(self) -> Float[AnyArray, "*batch"]:
         """The scale, if it is known."""
         return self.numbers[..., 1]
@@ -81,7 +88,7 @@ def pack_problem(problem: Problem, settings: Settings, size: Size) -> PackedProb
     columns[..., BOUND, :count], columns[..., CONFIDENCE, :count] = problem.noise_bound, problem.confidence
     columns[..., MASK, :count] = problem.mask
     scale = 1.0 if problem.scale is None else problem.scale
-    each = (problem.cbar2, scale, *jax.tree.leaves(settings))
+    each = (problem.cbar2, scale, 0.0, 0.0, 0.0, *jax.tree.leaves(settings))
     numbers = np.empty((*front, len(each)))
     for k, number in enumerate(each):
         numbers[..., k] = number
@@ -119,7 +126,7 @@ def unpack_settings(packed: PackedProblem, choices: Any) -> Settings:
         packed: What was sent.
         choices: Their structure (``jax.tree.structure``), which is all of them but their numbers.
     """
-    return jax.tree.unflatten(choices, list(packed.numbers[2:]))
+    return jax.tree.unflatten(choices, list(packed.numbers[SETTINGS:]))
 
 
 class Place(NamedTuple):

@@ -65,7 +65,9 @@ def after_search(
     """
     settings = unpack_settings(sent, choices)
     problem, excluded = clean(unpack_problem(sent))
-    return pack(conclude(problem, excluded, graph, clique, settings, cascade=cascade_in(few)))
+    return pack(
+        conclude(problem, excluded, graph, clique, settings, offset=sent.offset, cascade=cascade_in(few))
+    )
 
 
 class Programs(NamedTuple):

@@ -28,7 +28,9 @@ def solve_one(problem: Problem, settings: Settings) -> Solution:
             clique = finish_on_host(settings.clique, graph.edge_bits, graph.mask, clique)
         if settings.rotation.needs_host:  # step by step, with a solver on the host in between
             cleaned, excluded = clean(unpack_problem(near.sent))
-            solution = jax.device_get(conclude(cleaned, excluded, graph, clique, settings))
+            solution = jax.device_get(
+                conclude(cleaned, excluded, graph, clique, settings, offset=near.sent.offset)
+            )
         else:
             solution = unpack(fetch(ON_ONE_DEVICE.after(near.sent, graph, clique, choices)))
     solution = without_padding(solution, problem)

@@ -23,6 +23,7 @@ from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
 from teaser_jax.rows import keys
 from teaser_jax.solution import Status
+from teaser_jax.stages.position import matched_by_position
 from teaser_jax.stages.refinement import fit_similarity, squared_residuals
 
 # A turn by this angle must cost at least what one outlier costs.
@@ -58,6 +59,7 @@ class Evidence(NamedTuple):
         by_reflection: Members of the clique that it explains.
         has_left_range: Whether an unknown scale left the range it was looked for in.
         has_settled: Whether every iteration settled.
+        is_by_position: Whether the matches that the pose leaves out are nearest neighbours as given.
     """
 
     usable: Int[Array, ""]
@@ -71,6 +73,7 @@ class Evidence(NamedTuple):
     by_reflection: Int[Array, ""]
     has_left_range: Bool[Array, ""]
     has_settled: Bool[Array, ""]
+    is_by_position: Bool[Array, ""]
 
 
 def evidence_of(
@@ -83,6 +86,7 @@ def evidence_of(
     has_settled: Bool[Array, ""],
     pruned: bool = True,
     scale_range: tuple[Any, Any] = (0.0, float("inf")),
+    offset: Float[Array, "3"] | None = None,
 ) -> Evidence:
     """Collect what speaks for a pose and against it.
 
@@ -95,6 +99,8 @@ def evidence_of(
         has_settled: Whether every iteration settled.
         pruned: Whether ``clique`` is one.
         scale_range: Where an unknown scale was looked for [-].
+        offset: What to add to the source, as the clouds stand here, to compare it with the target in the
+            frames as given [length]; None: nothing.
 
     Gradients: none; inputs must be stopped by the caller.
     """
@@ -106,6 +112,7 @@ def evidence_of(
     no = jnp.zeros((), bool)
     by_reflection = explained_by_reflection(problem, clique)
     by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
+    r2 = squared_residuals(pose, problem.src, problem.dst, problem.noise_bound)
     low, high = scale_range
     outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
     return Evidence(
@@ -120,6 +127,9 @@ def evidence_of(
         by_reflection=by_reflection,
         has_left_range=outside if problem.scale is None else no,
         has_settled=has_settled,
+        is_by_position=matched_by_position(
+            problem.src, problem.dst, r2, problem.mask, cbar2=problem.cbar2, offset=offset
+        ),
     )
 
 
@@ -132,6 +142,7 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
     questions = (
         (e.usable < 3, Status.TOO_FEW_POINTS),
         (e.is_mirrored & half, Status.MIRRORED),
+        (e.is_by_position, Status.BY_POSITION),
         # Three matches that agree on their distances always make a pose: they are no evidence.
         ((e.members < 3) | (e.inliers <= 3) | e.has_left_range, Status.NO_CONSENSUS),
         (~e.is_determined, Status.DEGENERATE),
