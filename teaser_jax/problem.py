@@ -141,7 +141,7 @@ def read_problem(
     n = src.shape[0]
     if dtype is None:
         with jax.numpy_dtype_promotion("standard"):  # clouds may be of two kinds, whatever JAX is set to
-            dtype = jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst)))
+            dtype = wide_type(jnp.result_type(*(jax.dtypes.canonicalize_dtype(x.dtype) for x in (src, dst))))
     noise_bound = reading.one_a_match(noise_bound, "noise_bound", n)
     confidence = np.ones(n) if confidence is None else reading.one_a_match(confidence, "confidence", n)
     mask = np.ones(n, bool) if mask is None else reading.truth_values(mask, n)
@@ -159,6 +159,11 @@ def read_problem(
         scale=None if scale is None else scale.astype(dtype),
         pairs=None if pairs is None else pairs.astype(np.int32),
     )
+
+
+def wide_type(dtype: Any) -> np.dtype:
+    """Return the type in which numbers of a type are computed: float32 for half precision, else the same."""
+    return np.dtype(np.float32) if np.dtype(dtype).itemsize < 4 else np.dtype(dtype)
 
 
 def check_precision(problem: Problem) -> None:
@@ -239,10 +244,13 @@ def clean(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
     Whoever solves a problem cleans it once, at the door; the stages receive clean rows and never ask again.
     Values are replaced *before* anything is computed from them, so that neither results nor
     gradients of the other rows see a NaN. Without a truncation or a known scale that makes sense, no row can
-    be used.
+    be used. Half precision becomes float32: it has no linear algebra, and turns by a tenth of a degree.
 
     Gradients: exact for the rows that stay, zero for the others.
     """
+    problem = jax.tree.map(
+        lambda x: x.astype(wide_type(x.dtype)) if jnp.issubdtype(x.dtype, jnp.floating) else x, problem
+    )
     finite = (
         jnp.all(jnp.isfinite(problem.src), axis=1)
         & jnp.all(jnp.isfinite(problem.dst), axis=1)
