@@ -97,13 +97,14 @@ def test_forward_reverse_and_central_differences_agree(scale, x64):
 @pytest.mark.long
 def test_unrolling_the_iteration_gives_the_same_gradient(x64):
     problem = blurred(12, scale=1.3)
-    start = soften(problem, np.float64(1)).pose
+    found = soften(problem, np.float64(1))
+    start, bound = found.pose, problem.noise_bound * found.solution.selection.widening
     cotangent = np.random.default_rng(0).normal(size=(4, 4))
 
     def unrolled(dst):
         def step(_, pose):
-            r2 = squared_residuals(pose, problem.src, dst, problem.noise_bound)
-            w = problem.confidence / problem.noise_bound**2 * gnc_weights(r2, 1.0, problem.cbar2)
+            r2 = squared_residuals(pose, problem.src, dst, bound)
+            w = problem.confidence / bound**2 * gnc_weights(r2, 1.0, problem.cbar2)
             return fit_similarity(problem.src, dst, w, problem.scale).pose
 
         return jnp.sum(cotangent * lax.fori_loop(0, 60, step, start).matrix)
@@ -142,10 +143,11 @@ def test_a_stiff_control_gives_the_answer_of_solve(x64):
 def test_the_cost_is_stationary_and_least(x64):
     problem = blurred(14, scale=None)
     found = soften(problem, np.float64(1))
+    bound = problem.noise_bound * found.solution.selection.widening
 
     @jax.jit
     def cost(pose):
-        r2 = squared_residuals(pose, problem.src, problem.dst, problem.noise_bound)
+        r2 = squared_residuals(pose, problem.src, problem.dst, bound)
         return jnp.sum(problem.confidence * gnc_cost(r2, 1.0, problem.cbar2))
 
     rng = np.random.default_rng(0)

@@ -108,7 +108,7 @@ def test_the_first_failure_sticks():
 )
 def test_an_iteration_cap_is_reported(cap, x64):
     # Either takes more than one round here, and what it has found by then is no better founded.
-    matches = random_matches(4, wrong=0.4, noise_bound=0.1, noise=1.6, scale=1.3)
+    matches = random_matches(0, wrong=0.4, noise_bound=0.1, noise=1.6, scale=1.3)
     problem = problem_of(matches, scale=1.3)
     assert solve(problem).status == tj.Status.OK
     capped = solve(problem, tj.Settings(clique="greedy", **cap))
