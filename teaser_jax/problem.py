@@ -78,7 +78,12 @@ def make_problem(
         src, dst, noise_bound=noise_bound, scale=scale, cbar2=cbar2, mask=mask,
         confidence=confidence, pairs=pairs,
     )  # fmt: skip
-    return jax.tree.map(jnp.asarray, read)
+    return jax.tree.map(_on_device, read)
+
+
+def _on_device(array: AnyArray) -> Array:
+    """Put an array onto the device, on purpose: a guard against transfers is not for it."""
+    return array if isinstance(array, jax.Array) else jax.device_put(array)
 
 
 def host_problem(

@@ -17,6 +17,7 @@ from teaser_jax.engine.packing import pack_problem, unpack_problem
 from teaser_jax.engine.sizes import size_of
 from teaser_jax.ground.arrays import is_traced
 from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.problem import clean, host_problem
 from teaser_jax.register import INSIDE_JIT, Registration
 from teaser_jax.settings import Settings, check_settings
@@ -77,7 +78,7 @@ def profile(
     on_host = {"centre", "clique, host"} | ({"rotation"} if settings.rotation.needs_host else set())
     timed = Stopwatch(repeats, frozenset(on_host))
     near = timed("centre", centred_one, pack_problem(problem, settings, size_of(problem)))
-    with jax.enable_x64(True):
+    with as_on_the_host():
         p, excluded = timed("clean", clean, unpack_problem(near.sent))
         graph = prepare(p, settings, edge_dtype=near.edge_dtype, run=timed)
         found = timed("clique, device", search_on_device, settings.clique, graph.edge_bits, graph.mask)

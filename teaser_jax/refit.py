@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray, is_traced
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.rows import in_rows
@@ -58,7 +59,7 @@ def refit(problem: Problem, selection: Selection) -> Pose:
             "the selection was made with a known scale, and the problem has none: give its scale."
         )
     if isinstance(problem.src, np.ndarray) and not is_traced(problem, selection):
-        with jax.enable_x64(True):  # a problem in float64 is not rounded, whatever JAX is set to
+        with as_on_the_host():  # a problem in float64 is not rounded, whatever JAX is set to
             return jax.device_get(_compiled(problem, selection))
     return _refit(problem, selection)
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced, safe_norm, safe_sqrt
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose, as_pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.refit import refit
@@ -98,7 +99,7 @@ def covariance(
     if sigma is not None:
         sigma = _checked(sigma, problem)
     if isinstance(problem.src, np.ndarray) and not is_traced(problem, solution, sigma):
-        with jax.enable_x64(True):
+        with as_on_the_host():
             return jax.device_get(_covariance(problem, solution, sigma, convention))
     return _covariance(problem, solution, sigma, convention)
 

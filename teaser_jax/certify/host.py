@@ -28,6 +28,7 @@ from teaser_jax.certify.proof import (
 )
 from teaser_jax.engine.compiler import OLDER_EMITTERS, WHOLE_SUMS
 from teaser_jax.ground.arrays import AnyArray, inside_jit
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.stages.rotation.quadratic_form import Framed, in_frame_of
 
 QUICKLY = WHOLE_SUMS | OLDER_EMITTERS
@@ -63,11 +64,11 @@ class ClosedForm(NamedTuple):
 def in_float64(work: Callable[[], Result]) -> Result:
     """Do work on concrete numbers in float64, also while somebody's jit is traced around it."""
     if not inside_jit():
-        with jax.enable_x64(True):
+        with as_on_the_host():
             return work()
     # Programs with options of the compiler cannot be traced into others. Here they are constants, and what
     # they hold is compiled piece by piece, which is slow.
-    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+    with jax.ensure_compile_time_eval(), as_on_the_host():
         return work()
 
 

@@ -16,6 +16,7 @@ from teaser_jax.certify.host import framed
 from teaser_jax.certify.host_measurements import HostMeasurements, without_padding
 from teaser_jax.certify.proof import Attempt, claim_of, lowest_if_unproved, read_off
 from teaser_jax.certify.semidefinite import reaches
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.stages.rotation.quadratic_form import Measurements
 from teaser_jax.stages.rotation.relaxation import RelaxationReport, report, solve_relaxation
 
@@ -39,7 +40,7 @@ def relaxed_rotation(
         rotation: The best rotation known; the relaxation is written in its frame.
         tolerance: The suboptimality that counts as optimal [-].
     """
-    with jax.enable_x64(True):
+    with as_on_the_host():
         m, frame, constant = framed(without_padding(measurements), rotation)
         best = solve_relaxation(m)
         dual = Dual(best.relaxed.skew, best.relaxed.diagonal)

@@ -22,6 +22,7 @@ from teaser_jax.engine.groups import by_shape, pack_list
 from teaser_jax.engine.packing import PackedProblem, hide_rows, pack_problem, unpack
 from teaser_jax.engine.programs import Programs, device_kind, on_mesh, run_length, sharding_over
 from teaser_jax.engine.sizes import Size, size_of
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.problem import Problem
 from teaser_jax.settings import Settings
 from teaser_jax.solution import Solution
@@ -148,7 +149,7 @@ class Solver:
     def _solve(self, sent: PackedProblem, size: Size) -> Solution:
         """Solve packed problems of one size."""
         near = centred(sent)
-        with jax.enable_x64(True):  # of this thread only
+        with as_on_the_host():  # of this thread only
             runs, clique = self._find_cliques(near, size)
             solution = unpack(self._conclude(near.sent, runs, clique, size))
         return solution if near.origins is None else with_origins(solution, *near.origins)

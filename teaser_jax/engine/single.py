@@ -8,6 +8,7 @@ from teaser_jax.engine.frames import centred_one, with_origins, without_padding
 from teaser_jax.engine.packing import fetch, pack_problem, unpack, unpack_problem
 from teaser_jax.engine.programs import ON_ONE_DEVICE
 from teaser_jax.engine.sizes import size_of
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.problem import Problem, clean
 from teaser_jax.settings import Settings
 from teaser_jax.solution import Solution
@@ -22,7 +23,7 @@ def solve_one(problem: Problem, settings: Settings) -> Solution:
     """
     near = centred_one(pack_problem(problem, settings, size_of(problem)))
     choices = jax.tree.structure(settings)
-    with jax.enable_x64(True):
+    with as_on_the_host():
         graph, clique, settled = ON_ONE_DEVICE.before(near.sent, choices, near.edge_dtype)
         if settings.clique.needs_host and not settled:  # to look at it is to wait for the device
             clique = finish_on_host(settings.clique, graph.edge_bits, graph.mask, clique)

@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 from teaser_jax import metrics
 from teaser_jax.certify.options import CertifyMethod
 from teaser_jax.certify.rotation import certify_rotation
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose
 from teaser_jax.profile import profile
 from teaser_jax.register import register
@@ -119,7 +120,7 @@ def limit() -> Method:
 
     def answer(trial: Trial) -> Row:
         p = trial.problem
-        with jax.enable_x64(True):
+        with as_on_the_host():
             fit = _fit(p.src, p.dst, p.inliers.astype(float), trial.scale)
         return errors(trial, jax.device_get(fit.pose))
 
@@ -151,7 +152,7 @@ def scale_by_vote(criterion: Criterion) -> Method:
 
     def solve(trial: Trial) -> float:
         p = trial.for_solver()
-        with jax.enable_x64(True):
+        with as_on_the_host():
             return float(_scale(p.src, p.dst, p.noise_bound, p.mask, cbar2=1.0, criterion=criterion)[0])
 
     judge = lambda trial, scale: {"scale_error": abs(scale - float(trial.problem.truth.scale))}
@@ -163,7 +164,7 @@ def translation_by_vote(criterion: Criterion) -> Method:
 
     def solve(trial: Trial) -> np.ndarray:
         p = trial.for_solver()
-        with jax.enable_x64(True):
+        with as_on_the_host():
             found, _ = _translation(p.dst - p.src, p.noise_bound, p.mask, cbar2=1.0, criterion=criterion)
             return np.asarray(found)
 

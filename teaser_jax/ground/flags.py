@@ -1,0 +1,26 @@
+"""What JAX is set to while a door of the host computes: float64, and nothing that debugging asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import jax
+
+
+@contextmanager
+def as_on_the_host() -> Iterator[None]:
+    """Compute in float64, compiled, with transfers allowed, whatever this thread has JAX set to.
+
+    The doors of the host send numpy arrays and fetch numpy arrays: a guard against transfers is not meant for
+    them. Programs that run operation by operation (``jax_disable_jit``) take minutes, and NaN may stand in
+    rows that nothing is read from.
+    """
+    with (
+        jax.enable_x64(True),
+        jax.transfer_guard("allow"),
+        jax.disable_jit(False),
+        jax.debug_nans(False),
+        jax.debug_infs(False),
+    ):
+        yield

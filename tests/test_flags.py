@@ -1,0 +1,55 @@
+"""The doors of the host work whatever JAX is set to, each setting in a process of its own."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+README = Path(__file__).parents[1] / "README.md"
+FIRST_EXAMPLE = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)[0]
+OTHERS = """
+assert result.ok
+batch = tj.solve_batch([tj.host_problem(problem.src, problem.dst, noise_bound=problem.noise_bound)])
+assert batch[0].ok
+assert result.certificate.is_optimal in (True, False)
+assert tj.covariance(result).covariance.shape == (6, 6)
+tj.error_bounds(result)
+task = tj.make_problem(problem.src, problem.dst, noise_bound=problem.noise_bound)
+assert jax.jit(tj.solve)(task).ok
+"""
+SETTINGS = {
+    "jax_transfer_guard": "disallow",
+    "jax_numpy_rank_promotion": "raise",
+    "jax_numpy_dtype_promotion": "strict",
+    "jax_disable_jit": True,
+    "jax_debug_nans": True,
+    "jax_platforms": "cpu",
+    "jax_enable_x64": True,
+}
+
+
+def ran(lines: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("flag", SETTINGS)
+def test_the_first_example_and_the_other_doors(flag):
+    small = FIRST_EXAMPLE.replace("n=1000, outlier_rate=0.95", "n=60, outlier_rate=0.5")
+    assert small != FIRST_EXAMPLE
+    setting = f"import jax\njax.config.update({flag!r}, {SETTINGS[flag]!r})\n"
+    done = ran(setting + small + OTHERS)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_a_platform_that_is_not_there_is_named():
+    done = ran(
+        "import jax\njax.config.update('jax_platforms', 'nonsense')\nimport teaser_jax as tj\n"
+        "d = tj.synthetic.random_problem(0, n=30)\ntj.register(d.src, d.dst, noise_bound=0.1)"
+    )
+    assert done.returncode == 1
+    assert "nonsense" in done.stderr.splitlines()[-1]
