@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.agreement import Graph, prepare
 from teaser_jax.cascade import find_cascade
+from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.steps import Run, plainly
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, check_precision, clean
@@ -124,7 +125,7 @@ def find_inliers(
 
 def conclude(
     p: Problem, excluded: Int[Array, ""], graph: Graph, clique: Clique, settings: Settings,
-    *, offset: Float[Array, "3"] | None = None, cascade: Run = find_cascade, run: Run = plainly,
+    *, offset: Float[AnyArray, "3"] | None = None, cascade: Run = find_cascade, run: Run = plainly,
 ) -> Solution:  # fmt: skip
     """Find what lies behind the clique: the sets, the pose, and whether to trust it; in the user's rows.
 
@@ -153,7 +154,7 @@ def conclude(
 
 def judge(
     p: Problem, pose: Pose, selection: Selection, edge_bits: UInt32[Array, "n w"], settled: Bool[Array, ""],
-    settings: Settings, offset: Float[Array, "3"] | None,
+    settings: Settings, offset: Float[AnyArray, "3"] | None,
 ) -> Int[Array, ""]:  # fmt: skip
     """Decide the status of a pose, from what speaks for it and against it."""
     evidence = evidence_of(

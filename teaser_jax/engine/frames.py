@@ -75,7 +75,8 @@ def centred(sent: PackedProblem) -> Centred:
             if usable.any():
                 origin[k] = middle(cloud[k][:, usable].T)
                 cloud[k] -= origin[k][:, None]
-    sent.offset[...] = origins[0] - origins[1]
+    with np.errstate(over="ignore"):  # of points at the end of all numbers
+        sent.offset[...] = origins[0] - origins[1]
     return Centred(sent, origins, _narrow(sent))
 
 

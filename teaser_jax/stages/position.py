@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax.ground import bits
+from teaser_jax.ground.arrays import AnyArray
 
 FEWEST = 20  # matches unexplained, below which there is no evidence
 ASKED, FEWEST_HEARD = 24, 8  # of them, and without those that share a point
@@ -30,7 +31,7 @@ def matched_by_position(
     mask: Bool[Array, " n"],
     *,
     cbar2: Float[Array, ""],
-    offset: Float[Array, "3"] | None = None,
+    offset: Float[AnyArray, "3"] | None = None,
 ) -> Bool[Array, ""]:
     """Tell whether the matches that a pose does not explain are nearest neighbours as given.
 
@@ -58,11 +59,13 @@ def matched_by_position(
     usable = jnp.sum(mask, dtype=jnp.int32).astype(src.dtype)
     few = jnp.maximum(FEW, SMALL_SHARE * usable)
     near = jnp.zeros(len(asked), bool)
-    own = jnp.sum((given[asked] - dst[asked]) ** 2, axis=1)
     for here, there in ((given, dst), (dst, given)):
-        distance = sum((here[asked, None, k] - there[None, :, k]) ** 2 for k in range(3))
-        nearer = jnp.sum(mask[None] & (distance < (1 - 1e-5) * own[:, None]), axis=1, dtype=jnp.int32)
-        near |= (nearer.astype(src.dtype) <= few) & jnp.isfinite(own)
+        # |c - a|^2 < |b - a|^2 of a match (a, b) and a point c, without their digits where a is far away.
+        aside = [there[None, :, k] - there[asked, None, k] for k in range(3)]
+        apart = [there[asked, None, k] - here[asked, None, k] for k in range(3)]
+        excess = jnp.asarray(sum(x * (x + 2 * y) for x, y in zip(aside, apart, strict=True)))
+        nearer = jnp.sum(mask[None] & ~(excess >= 0), axis=1, dtype=jnp.int32)
+        near |= nearer.astype(src.dtype) <= few
     # Points that many matches share are asked once: all matches that lead to one point lead to the nearest.
     index = jnp.arange(len(asked), dtype=jnp.int32)
     fresh = (index < count) & ~_seen_before(src[asked]) & ~_seen_before(dst[asked])

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
 from teaser_jax.ground import bits
+from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
 from teaser_jax.rows import keys
@@ -86,7 +87,7 @@ def evidence_of(
     has_settled: Bool[Array, ""],
     pruned: bool = True,
     scale_range: tuple[Any, Any] = (0.0, float("inf")),
-    offset: Float[Array, "3"] | None = None,
+    offset: Float[AnyArray, "3"] | None = None,
 ) -> Evidence:
     """Collect what speaks for a pose and against it.
 
