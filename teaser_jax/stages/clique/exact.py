@@ -25,6 +25,7 @@ from teaser_jax.ground.numbers import TracedNumber, count, named, number, settle
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.greedy import DROPPED_SHARE, greedy_clique
 from teaser_jax.stages.clique.oracle import networkx_clique
+from teaser_jax.stages.clique.watch import Watch
 
 log = logging.getLogger("teaser_jax")
 
@@ -110,6 +111,7 @@ class _Search:
 
         self.reduction, self.branching = reduction, branching
         self.deadline = time.perf_counter() + seconds
+        self.watch = Watch()
         self.nodes_left = nodes
         self.n = found.members.shape[0]
         self.best = np.flatnonzero(found.members).astype(np.int64)
@@ -119,7 +121,7 @@ class _Search:
 
     def run(self) -> Clique:
         """Search the graph until the maximum is proved or a budget is spent."""
-        with suppress(_OutOfBudget):  # best and upper say how far it came
+        with self.watch, suppress(_OutOfBudget):  # best and upper say how far it came
             self.reduce()
             self.order_and_branch()
         members = np.zeros(self.n, bool)
@@ -127,7 +129,8 @@ class _Search:
         return Clique(members, np.int32(self.upper))
 
     def check_budget(self) -> None:
-        """End the search if time or nodes are spent."""
+        """End the search if time or nodes are spent; show how far it is, and let an interrupt through."""
+        self.watch.look(len(self.best), self.upper)
         if time.perf_counter() >= self.deadline or self.nodes_left <= 0:
             raise _OutOfBudget
 
