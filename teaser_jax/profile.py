@@ -85,9 +85,7 @@ def profile(
         clique = timed("clique, host", finish_on_host, settings.clique, graph.edge_bits, graph.mask, found)
         found = conclude(p, excluded, graph, clique, settings, offset=near.sent.offset, run=timed)
         solution = jax.device_get(found)
-    solution = without_padding(solution, problem)
-    if near.origins is not None:
-        solution = with_origins(solution, *near.origins)
+    solution = with_origins(without_padding(solution, problem), near.origins)
     medians = {name: float(np.median(seconds)) for name, seconds in timed.warm.items()}
     return Profile(timed.cold, medians, Registration.of(problem, solution))
 

@@ -94,9 +94,14 @@ def as_solved(p: Problem, selection: Selection) -> tuple[Problem, Selection]:
 
 def as_judged(problem: Problem, selection: Selection) -> Problem:
     """Mask the copies of a problem and widen its bounds, in the user's rows; traced or in numpy."""
-    if selection.rows is not None:
-        problem = replace(problem, mask=problem.mask & selection.rows.alone)
-    return widened(problem, selection.widening)
+    return widened(without_copies(problem, selection), selection.widening)
+
+
+def without_copies(problem: Problem, selection: Selection) -> Problem:
+    """Mask the rows that another one stands for: a copy says nothing new."""
+    if selection.rows is None:
+        return problem
+    return replace(problem, mask=problem.mask & selection.rows.alone)
 
 
 def widened(problem: Problem, widening: Float[AnyArray, ""]) -> Problem:

@@ -21,7 +21,7 @@ from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced, safe_norm
 from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose, as_pose
 from teaser_jax.problem import Problem, clean
-from teaser_jax.refit import refit
+from teaser_jax.refit import refit, without_copies
 from teaser_jax.solution import Solution, problem_and_solution
 from teaser_jax.stages.refinement import squared_residuals
 
@@ -178,9 +178,7 @@ class _Central(NamedTuple):
 
 @jax.jit
 def _about_the_middle(problem: Problem, solution: Solution, sigma: Any) -> _Central:
-    p, _ = clean(problem)
-    if solution.selection.rows is not None:  # a copy says nothing new
-        p = replace(p, mask=p.mask & solution.selection.rows.alone)
+    p = without_copies(clean(problem)[0], solution.selection)
     solution = replace(solution, inliers=solution.inliers & p.mask)
     pose = jax.tree.map(jnp.asarray, solution.pose)
     deviation = _estimated(p, solution) if sigma is None else jnp.asarray(sigma, p.dst.dtype)

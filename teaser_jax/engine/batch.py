@@ -152,7 +152,7 @@ class Solver:
         with as_on_the_host():  # of this thread only
             runs, clique = self._find_cliques(near, size)
             solution = unpack(self._conclude(near.sent, runs, clique, size))
-        return solution if near.origins is None else with_origins(solution, *near.origins)
+        return with_origins(solution, near.origins)
 
     def _find_cliques(self, near: Centred, size: Size) -> tuple[list[Run], Clique]:
         """Send all problems through the first program, and search on the host what it leaves open."""

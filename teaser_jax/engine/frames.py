@@ -116,10 +116,12 @@ def _narrow_among(sent: PackedProblem, usable: Bool[np.ndarray, "b n"]) -> Bool[
 
 
 def with_origins(
-    solution: Solution, src_origin: Float[np.ndarray, "*b 3"], dst_origin: Float[np.ndarray, "*b 3"]
+    solution: Solution, origins: tuple[Float[np.ndarray, "*b 3"], Float[np.ndarray, "*b 3"]] | None
 ) -> Solution:
     """Carry the solution of centred clouds (or a stack of them) back to the frames that these came from."""
-    pose = solution.pose
+    if origins is None:
+        return solution
+    (src_origin, dst_origin), pose = origins, solution.pose
     turned = so3.rotate(pose.rotation, src_origin[..., None, :])[..., 0, :]
     with np.errstate(over="ignore", invalid="ignore"):  # of points at the end of all numbers
         translation = dst_origin + pose.translation - pose.scale[..., None] * turned

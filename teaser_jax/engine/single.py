@@ -34,5 +34,4 @@ def solve_one(problem: Problem, settings: Settings) -> Solution:
             )
         else:
             solution = unpack(fetch(ON_ONE_DEVICE.after(near.sent, graph, clique, choices)))
-    solution = without_padding(solution, problem)
-    return solution if near.origins is None else with_origins(solution, *near.origins)
+    return with_origins(without_padding(solution, problem), near.origins)
