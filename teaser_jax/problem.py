@@ -242,6 +242,12 @@ def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
     )
 
 
+def _in_range(numbers: Float[Array, "*k"]) -> Bool[Array, "*k"]:
+    """Tell which numbers are above zero and have a cube, as derivatives by a bound do: 1e-12 to 1e12 in float32."""
+    most = float(jnp.finfo(numbers.dtype).max) ** 0.32
+    return (numbers > 1 / most) & (numbers < most)
+
+
 @jax.jit  # one operation for those who call it outside jit
 def clean(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
     """Mask unusable rows of a problem and make them harmless; count the rows that are not finite.
@@ -262,11 +268,15 @@ def clean(problem: Problem) -> tuple[Problem, Int[Array, ""]]:
         & jnp.isfinite(problem.noise_bound)
         & jnp.isfinite(problem.confidence)
     )
-    usable = problem.mask & finite & (problem.noise_bound > 0) & (problem.confidence > 0)
+    bound, confidence = problem.noise_bound, problem.confidence
+    usable = problem.mask & finite & _in_range(bound) & _in_range(confidence)
+    usable &= _in_range(bound / jnp.sqrt(jnp.where(usable, confidence, 1)))
+    # A bound that is lost in the digits of its point. Outside jit it is refused.
+    usable &= bound > jnp.finfo(bound.dtype).eps * jnp.max(jnp.abs(problem.dst), axis=1)
     cbar2, scale = problem.cbar2, problem.scale
-    sensible = jnp.isfinite(cbar2) & (cbar2 > 0)
+    sensible = _in_range(cbar2)
     if scale is not None:
-        sensible &= jnp.isfinite(scale) & (scale > 0)
+        sensible &= _in_range(scale)
         scale = jnp.where(sensible, scale, 1)
     usable &= sensible
     cleaned = replace(
