@@ -243,8 +243,8 @@ def pad_problem(problem: Problem, n: int, m: int | None = None) -> Problem:
 
 
 def _in_range(numbers: Float[Array, "*k"]) -> Bool[Array, "*k"]:
-    """Tell which numbers are above zero and have a cube, as derivatives by a bound do: 1e-12 to 1e12 in float32."""
-    most = float(jnp.finfo(numbers.dtype).max) ** 0.32
+    """Tell which numbers are above zero and have a cube, as derivatives by a bound do."""
+    most = float(jnp.finfo(numbers.dtype).max) ** 0.32  # 1e12 in float32
     return (numbers > 1 / most) & (numbers < most)
 
 
