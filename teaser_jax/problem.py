@@ -59,12 +59,13 @@ def make_problem(
     Args:
         src, dst: (n, 3) points, any real dtype; integers become floats, entries that a numpy
             masked array hides become NaN. Clouds of Open3D and structured arrays with x, y, z are read, too.
-        noise_bound: Largest error of a right match [length unit of the points], one number or (n,).
+        noise_bound: Largest error of a right match [length unit of dst], one number or (n,).
         scale: The known scale [-], or None: estimate it.
         cbar2: Truncation of the cost, c-bar squared [-].
         mask: (n,) rows to use.
         confidence: (n,) weights >= 0 of the matches in the final fit; 0 equals masked.
-        pairs: (m, 2) index pairs to compare, or a ``networkx.Graph`` on row numbers; None: all.
+        pairs: (m, 2) rows to compare with one another (not correspondences), or a ``networkx.Graph`` on row
+            numbers; None: all.
 
     Returns:
         A pytree for ``solve``; its dtype is that of the points (float32 unless JAX's x64 is on).
@@ -139,9 +140,14 @@ def read_problem(
     """
     src, dst = reading.point_rows(src, "src"), reading.point_rows(dst, "dst")
     if src.shape[0] != dst.shape[0]:
+        cure = (
+            "Match the clouds first and index both with the matches."
+            if pairs is None
+            else "If pairs are correspondences, pass src[pairs[:, 0]] and dst[pairs[:, 1]], without pairs."
+        )
         raise ValueError(
             f"src has {src.shape[0]} rows and dst has {dst.shape[0]}: rows are matches, row i of src "
-            "with row i of dst. Match the clouds first and index both with the matches."
+            f"with row i of dst. {cure}"
         )
     n = src.shape[0]
     if dtype is None:

@@ -13,6 +13,7 @@ from jaxtyping import Bool
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import compile_ahead
 from teaser_jax.certify.pose import certify as certify_pose
+from teaser_jax.diagnosis import advice
 from teaser_jax.engine.compiler import is_out_of_memory
 from teaser_jax.engine.single import solve_one
 from teaser_jax.engine.sizes import padded_size
@@ -38,7 +39,7 @@ class Registration:
     Attributes:
         pose: ``T_dst_src``.
         inliers: (n,) matches that the pose explains.
-        status: What happened; ``status.advice`` says what to try.
+        status: What happened, as a number that programs can ask for.
         solution: Pose, status and the sets behind them, as a pytree of numpy arrays.
         problem: What was asked, as read: ``certify`` and ``refit`` take it with the solution.
     """
@@ -65,6 +66,15 @@ class Registration:
         ``certify(result, ...)`` has more choices. It never turns ``ok`` true.
         """
         return certify_pose(self.problem, self.solution)
+
+    @cached_property
+    def advice(self) -> str:
+        """What happened and what to try, in sentences.
+
+        Where the answer is not ok, causes that the numbers show come first: a bound larger than the scene,
+        or another scale at which the matches agree, for which the problem is solved once more.
+        """
+        return advice(self.problem, self.solution)
 
     @property
     def has_certificate(self) -> bool:
@@ -105,12 +115,13 @@ def register(
     Args:
         src, dst: (n, 3) points, row i with row i; anything with ``__array__`` or ``__dlpack__``, clouds of
             Open3D, structured arrays with x, y, z.
-        noise_bound: Largest error of a right match, one number or (n,) [unit of the points].
+        noise_bound: Largest error of a right match, one number or (n,) [unit of dst].
         scale: Known scale [-], or None: estimate it.
         cbar2: Truncation of the cost, c-bar squared [-].
         mask: (n,) rows to use.
         confidence: (n,) weights of the matches in the final fit; 0 equals masked.
-        pairs: (m, 2) index pairs to compare, or a ``networkx.Graph``; None: all.
+        pairs: (m, 2) rows to compare with one another (not correspondences), or a ``networkx.Graph``; None:
+            all.
         settings: How to solve.
         certify: Compute ``result.certificate`` at once, for the summary to tell.
 

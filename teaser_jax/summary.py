@@ -34,7 +34,7 @@ def summary(result: Registration) -> str:
         f"  cost         {float(s.cost):.6g}: each match adds (residual / noise bound)^2, but cbar2 at most",
         *_wide(s),
         *_proofs(result),
-        f"  {result.status.advice}",
+        f"  {result.advice}",
     ]
     return "\n".join(rows)
 

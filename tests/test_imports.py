@@ -28,7 +28,7 @@ ORDER = [
     "stages.translation", "stages.refinement", "stages.position", "stages.verdict",
     "settings", "refit", "agreement", "cascade", "solve", "soft", "uncertainty",
     "engine.compiler", "engine.sizes", "engine.packing", "engine.frames", "engine.compaction",
-    "engine.programs", "engine.single",
+    "engine.programs", "engine.single", "diagnosis",
     "engine.groups", "engine.processes", "engine.batch",
     "certify.dual", "certify.projection", "certify.semidefinite", "certify.splitting",
     "certify.certificate",

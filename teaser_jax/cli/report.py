@@ -36,7 +36,7 @@ def as_plain_data(result: Registration, truth: Pose | None, seconds: float) -> d
     report = {
         "ok": result.ok,
         "status": result.status.name,
-        "advice": result.status.advice,
+        "advice": result.advice,
         "pose": {
             "scale": _plain(pose.scale),
             "rotation": _plain(pose.rotation),
