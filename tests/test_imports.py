@@ -25,7 +25,7 @@ ORDER = [
     "stages.rotation.tims", "stages.rotation.gnc", "stages.rotation.quadratic_form",
     "stages.rotation.pair_search",
     "stages.rotation.relaxation", "stages.rotation.robust",
-    "stages.translation", "stages.refinement", "stages.position", "stages.verdict",
+    "stages.translation", "stages.refinement", "stages.position", "stages.chance", "stages.verdict",
     "settings", "refit", "agreement", "cascade", "solve", "soft", "uncertainty",
     "engine.compiler", "engine.sizes", "engine.packing", "engine.frames", "engine.compaction",
     "engine.programs", "engine.single", "diagnosis",

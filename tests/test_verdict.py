@@ -9,7 +9,7 @@ from oracles import problem_of, random_matches, solve
 
 import teaser_jax as tj
 from teaser_jax.settings import ExactClique, Gnc, Refinement, ScaleVote
-from teaser_jax.stages import verdict
+from teaser_jax.stages import chance, verdict
 from teaser_jax.synthetic import draw_rotation, random_problem
 
 BOUND = 0.05
@@ -48,6 +48,30 @@ def test_three_clean_matches_among_few_are_not_beyond_chance():
 def test_wrong_matches_are_never_ok(n, seed):
     problem = random_problem((n, seed), n=n, outlier_rate=1.0, radius=1.0)
     assert status(problem.src, problem.dst) != tj.Status.OK
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("scale", [0.5, 0.8, 1.2, 2.0])
+@pytest.mark.parametrize("rate", [0.0, 0.5])
+def test_a_wrong_scale_is_never_ok_where_it_leaves_right_matches_out(scale, rate):
+    """Right matches that lie close together agree at any scale, and are many where all are many."""
+    few = 0
+    for seed in range(5):
+        drawn = random_problem((1, seed), n=250, outlier_rate=rate, scale=scale)
+        found = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+        if found.inliers[drawn.inliers].mean() < 0.7:
+            few += 1
+            assert not found.ok
+    assert few >= 2
+
+
+@pytest.mark.long
+def test_a_scale_off_by_less_than_the_bound_is_none_of_that():
+    for seed in range(5):
+        drawn = random_problem((1, seed), n=250, outlier_rate=0.5, scale=1.02)
+        found = tj.register(drawn.src, drawn.dst, noise_bound=drawn.noise_bound)
+        assert found.ok
+        assert found.inliers[drawn.inliers].all()
 
 
 def test_a_mirror_image_has_no_pose():
@@ -117,7 +141,7 @@ def test_an_iteration_cap_is_reported(cap, x64):
 
 
 def test_turns_are_rotations_far_from_none_and_spread():
-    turns = verdict.TURNS
+    turns = chance.TURNS
     assert len(turns) >= 60
     np.testing.assert_allclose(
         np.swapaxes(turns, 1, 2) @ turns, np.broadcast_to(np.eye(3), turns.shape), atol=1e-12
@@ -134,7 +158,8 @@ def test_inliers_that_huddle_count_as_chance(x64):
     src = np.concatenate([0.01 * cloud(40), 5 + cloud(24)])
     problem = tj.make_problem(src, src, noise_bound=BOUND)
     pose = tj.Pose(np.eye(3), np.zeros(3), np.ones(()))
-    counts = np.asarray(jax.jit(verdict.chance_inliers)(problem, pose, np.arange(n) < 40))
+    counts = np.asarray(jax.jit(chance.chance_inliers)(problem, pose, np.arange(n) < 40))
+    assert counts.shape == (2, len(chance.TURNS))
     assert counts.min() == 39
 
 

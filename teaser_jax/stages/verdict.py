@@ -3,8 +3,8 @@
 A maximum clique always exists, also when every match is wrong. Three questions separate an answer
 from an accident. Would the cost notice if the pose turned? How many poses with as many inliers
 would wrong matches produce by themselves? Did the clique's members find a place in one pose at
-all, or only in its mirror image? The thresholds were set on synthetic and real problems, right
-and wrong; ``benchmarks/trust.py`` measures what they are worth.
+all, or only in its mirror image, or at another scale? The thresholds were set on synthetic and
+real problems, right and wrong; ``benchmarks/trust.py`` measures what they are worth.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jax.scipy.special import xlogy
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax import so3
@@ -24,8 +22,9 @@ from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
 from teaser_jax.rows import keys
 from teaser_jax.solution import Status
+from teaser_jax.stages.chance import log_false_alarms
 from teaser_jax.stages.position import matched_by_position
-from teaser_jax.stages.refinement import fit_similarity, squared_residuals
+from teaser_jax.stages.refinement import Fit, fit_similarity, squared_residuals
 
 # A turn by this angle must cost at least what one outlier costs.
 SMALLEST_TURN = np.deg2rad(20.0)
@@ -38,6 +37,10 @@ LEAST_SHARE_OF_CLIQUE = 0.25
 MOST_SHARE_OF_MIRROR = 1.25
 # So many matches of a clique, and half of it, must a reflection explain for the clouds to be mirror images.
 LEAST_MIRRORED = 8
+# Another scale than the known one, fitted to the inliers, may explain so many times as many: with a scale
+# forgotten (1.2 to 2, or their inverses) 1.5 to 40 times, unless nearly all lie within the bound as it is;
+# on real pairs at most 1.12 times.
+MOST_SHARE_OF_OTHER_SCALE = 1.25
 # How far refinement may carry a scale out of the range it was looked for in.
 SCALE_SLACK = 0.02
 # Poses by chance that are tolerated, as a natural logarithm: one in a hundred.
@@ -58,6 +61,8 @@ class Evidence(NamedTuple):
         has_collapsed: Whether most members of the clique found no place in the pose.
         is_mirrored: Whether a reflection explains the clique better.
         by_reflection: Members of the clique that it explains.
+        by_fit: Matches that the inliers' own fit explains, at the known scale where there is one.
+        by_other_scale: Matches that it explains at the scale that suits the inliers best.
         has_left_range: Whether an unknown scale left the range it was looked for in.
         has_settled: Whether every iteration settled.
         is_by_position: Whether the matches that the pose leaves out are nearest neighbours as given.
@@ -72,6 +77,8 @@ class Evidence(NamedTuple):
     has_collapsed: Bool[Array, ""]
     is_mirrored: Bool[Array, ""]
     by_reflection: Int[Array, ""]
+    by_fit: Int[Array, ""]
+    by_other_scale: Int[Array, ""]
     has_left_range: Bool[Array, ""]
     has_settled: Bool[Array, ""]
     is_by_position: Bool[Array, ""]
@@ -108,12 +115,12 @@ def evidence_of(
     dtype = problem.src.dtype
     members, agreeing = jnp.sum(clique, dtype=jnp.int32), jnp.sum(inliers, dtype=jnp.int32)
     distinct = jnp.minimum(*(count_distinct(x, inliers) for x in (problem.src, problem.dst)))
-    alarms = log_false_alarms(problem, pose, inliers, bits.count(edge_bits))
     fewest = LEAST_SHARE_OF_CLIQUE * members.astype(dtype)
     no = jnp.zeros((), bool)
     by_reflection = explained_by_reflection(problem, clique)
     by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
     r2 = squared_residuals(pose, problem.src, problem.dst, problem.noise_bound)
+    fit, free = (fit_of_inliers(problem, inliers, scale) for scale in (problem.scale, None))
     low, high = scale_range
     outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
     return Evidence(
@@ -121,11 +128,13 @@ def evidence_of(
         members=members,
         inliers=agreeing,
         distinct=distinct,
-        is_determined=is_determined(problem, pose, inliers),
-        log_false_alarms=alarms,
+        is_determined=is_determined(problem, pose, inliers, fit),
+        log_false_alarms=log_false_alarms(problem, pose, inliers, r2, bits.count(edge_bits)),
         has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
         is_mirrored=by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype),
         by_reflection=by_reflection,
+        by_fit=count_explained(problem, fit.pose),
+        by_other_scale=count_explained(problem, free.pose),
         has_left_range=outside if problem.scale is None else no,
         has_settled=has_settled,
         is_by_position=matched_by_position(
@@ -139,6 +148,8 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
     e = evidence
     # Few wrong matches that agree pairwise are mirrored as often as not; many have a cause.
     half = (2 * e.by_reflection >= e.members) & (e.by_reflection >= LEAST_MIRRORED)
+    most = MOST_SHARE_OF_OTHER_SCALE * jnp.maximum(e.inliers, e.by_fit).astype(jnp.float32)
+    has_other_scale = e.by_other_scale.astype(jnp.float32) > most
     by_chance = (e.distinct <= 3) | (e.log_false_alarms > LARGEST_LOG_FALSE_ALARMS)
     questions = (
         (e.usable < 3, Status.TOO_FEW_POINTS),
@@ -147,7 +158,7 @@ def status_of(evidence: Evidence) -> Int[Array, ""]:
         # Three matches that agree on their distances always make a pose: they are no evidence.
         ((e.members < 3) | (e.inliers <= 3) | e.has_left_range, Status.NO_CONSENSUS),
         (~e.is_determined, Status.DEGENERATE),
-        (by_chance | e.has_collapsed | e.is_mirrored, Status.NO_CONSENSUS),
+        (by_chance | e.has_collapsed | e.is_mirrored | has_other_scale, Status.NO_CONSENSUS),
         (~e.has_settled, Status.NOT_CONVERGED),
     )
     verdict = jnp.int32(Status.OK)
@@ -180,7 +191,23 @@ def count_distinct(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> In
     return jnp.sum(taken, dtype=jnp.int32)
 
 
-def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Bool[Array, ""]:
+def fit_of_inliers(problem: Problem, inliers: Bool[Array, " n"], scale: Float[Array, ""] | None) -> Fit:
+    """Fit the inliers at a scale, or at the one that suits them best.
+
+    Where the known scale is wrong, matches that lie close together agree within their bounds all the same and
+    tell the right one.
+    """
+    weights = jnp.where(inliers, problem.confidence / problem.noise_bound**2, 0)
+    return fit_similarity(problem.src, problem.dst, weights, scale)
+
+
+def count_explained(problem: Problem, pose: Pose) -> Int[Array, ""]:
+    """Count the matches that a pose explains."""
+    r2 = squared_residuals(pose, problem.src, problem.dst, problem.noise_bound)
+    return jnp.sum((r2 <= problem.cbar2) & problem.mask, dtype=jnp.int32)
+
+
+def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"], fit: Fit) -> Bool[Array, ""]:
     """Tell whether the inliers fix the rotation (and with it the scale).
 
     Turning the pose by an angle about its weakest axis raises the cost (6) by
@@ -190,8 +217,6 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
     rest cannot hold the pose. And a source that shrinks into the noise (s times its radius within
     c beta) agrees with every rotation.
     """
-    weights = jnp.where(inliers, problem.confidence / problem.noise_bound**2, 0)
-    fit = fit_similarity(problem.src, problem.dst, weights, problem.scale)
     most = jnp.max(jnp.where(inliers, problem.confidence, 0), initial=0)
     turned = jnp.sum(pose.rotation[:, :, None] * fit.correlation[:, None, :], axis=0)
     left = jnp.trace(turned) - so3.largest_eigenvalue((turned + turned.T) / 2)
@@ -200,77 +225,3 @@ def is_determined(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> B
     reach2 = jnp.where(inliers, problem.cbar2 * problem.noise_bound**2, jnp.inf)
     extended = pose.scale**2 * jnp.max(radius2, initial=0) > jnp.min(reach2, initial=jnp.inf)
     return (rise >= problem.cbar2) & extended
-
-
-def log_false_alarms(
-    problem: Problem, pose: Pose, inliers: Bool[Array, " n"], degrees: Int[Array, " n"]
-) -> Float[Array, ""]:
-    """Estimate the log of the expected number of poses with as many inliers if all matches were wrong.
-
-    Three matches that agree on their distances make a pose; the rest of its inliers must come by
-    chance. So: the number of triangles in a random graph of the same degrees, times the
-    probability that such a pose collects as many further inliers, from the counts of poses
-    through one match turned at random. These counts vary more than a Poisson law allows where
-    matches crowd together, so their mean and variance set a negative binomial, whose tail is
-    bounded by Chernoff.
-
-    References: a-contrario reasoning after Moisan and Stival, IJCV 2004; Chung and Lu for the graph.
-    """
-    dtype = problem.src.dtype
-    counts = chance_inliers(problem, pose, inliers).astype(dtype)
-    # One hit more than seen: some dozens of poses cannot prove that chance never hits.
-    mean = (jnp.sum(counts) + 1) / len(TURNS)
-    excess = jnp.maximum(jnp.mean((counts - mean) ** 2) - mean, 1e-3 * mean)
-    shape = mean**2 / excess
-    further = jnp.maximum(jnp.sum(inliers, dtype=jnp.int32) - 3, 0).astype(dtype)
-    tail = xlogy(further, further / mean) - (further + shape) * jnp.log((further + shape) / (mean + shape))
-    tail = jnp.where(further > mean, tail, 0)
-    degree = degrees.astype(dtype)
-    ends = jnp.maximum(jnp.sum(degree), 1)
-    # (sum d^2)^3 / (6 (sum d)^3), scaled to stay finite in float32.
-    triangles = (jnp.sum(degree * (degree / ends)) ** 3) / 6
-    return jnp.log(jnp.maximum(triangles, 1)) - tail
-
-
-def chance_inliers(problem: Problem, pose: Pose, inliers: Bool[Array, " n"]) -> Int[Array, " k"]:
-    """Count the further matches that agree with poses through one inlier, turned evenly over SO(3).
-
-    Inliers that huddle within the noise stay together whatever the turn, and many-to-one matches
-    too: they count as chance, as they should.
-    """
-    src, dst, mask = problem.src, problem.dst, problem.mask
-    if src.shape[0] == 0:
-        return jnp.zeros(len(TURNS), jnp.int32)
-    which = jnp.arange(len(TURNS), dtype=jnp.int32) % jnp.maximum(jnp.sum(inliers, dtype=jnp.int32), 1)
-    pivots = bits.listed(inliers)[which]
-    # From the first pivot, so that no digits are lost far from the origin.
-    x, y = (points.T - points[pivots[0]][:, None] for points in (src, dst))
-    a, b, entries = x[:, pivots], y[:, pivots], jnp.asarray(TURNS, src.dtype)
-    # Component by component: pairs of turns and matches are met in one pass and never stored. The barrier
-    # keeps what belongs to a turn alone out of that pass, where a GPU would find it anew for every match.
-    turned = [
-        sum(entries[:, i, k] * pose.rotation[k, j] for k in range(3)) for i in range(3) for j in range(3)
-    ]
-    by_turn = pose.scale * jnp.stack(turned).reshape(3, 3, -1)
-    offset = jnp.stack([b[i] - sum(by_turn[i, j] * a[j] for j in range(3)) for i in range(3)])
-    by_turn, offset = lax.optimization_barrier((by_turn, offset))
-    residual2 = jnp.zeros((), src.dtype)
-    for i in range(3):
-        moved = sum(by_turn[i, j][:, None] * x[j][None] for j in range(3))
-        residual2 += (y[i][None] - offset[i][:, None] - moved) ** 2
-    agree = (residual2 <= (problem.cbar2 * problem.noise_bound**2)[None]) & mask[None]
-    return jnp.sum(agree, axis=1, dtype=jnp.int32) - mask[pivots].astype(jnp.int32)
-
-
-def _even_rotations(count: int, smallest_angle: float) -> np.ndarray:
-    """Spread rotations evenly over SO(3) by the super-Fibonacci spiral (Alexa, CVPR 2022), no small ones."""
-    s = np.arange(count) + 0.5
-    inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
-    alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
-    quats = [inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)]
-    rotations = so3.rotation_from_quat(np.stack(quats, axis=1))
-    return rotations[so3.rotation_angle(rotations) > smallest_angle]
-
-
-# Turns away from a candidate: large enough that its own inliers do not come along.
-TURNS = _even_rotations(70, np.deg2rad(45.0))
