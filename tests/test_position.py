@@ -51,8 +51,9 @@ def test_nearest_neighbours_as_given_are_refused(shape, degrees, scale):
         result = tj.register(a, b, noise_bound=0.05, scale=scale)
         assert result.status == tj.Status.BY_POSITION
         assert "descriptors" in str(result)
-    problems = [tj.host_problem(a, b, noise_bound=0.05, scale=scale) for a, b in ((src, near), (near, src))]
-    assert all(s.status == tj.Status.BY_POSITION for s in tj.solve_batch(problems))
+    if scale is not None:  # a batch asks the same question, whatever is known
+        problems = [tj.host_problem(a, b, noise_bound=0.05) for a, b in ((src, near), (near, src))]
+        assert all(s.status == tj.Status.BY_POSITION for s in tj.solve_batch(problems))
 
 
 @pytest.mark.long

@@ -13,6 +13,7 @@ import teaser_jax as tj
 from teaser_jax.certify.certificate import CertificateStatus, CertifiedBy
 from teaser_jax.certify.dual import Dual, dual_matrix
 from teaser_jax.certify.relaxation import turned_dual
+from teaser_jax.stages.rotation import relaxation
 from teaser_jax.stages.rotation.quadratic_form import Measurements, cost_matrix
 from teaser_jax.stages.rotation.relaxation import MAX_RELAXED, relax
 
@@ -117,3 +118,31 @@ def test_no_proof_asked_for():
     assert found.certificate is None
     assert found.relaxation.is_tight
     assert CertificateStatus.OPTIMAL.advice
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("extent", [40, 400, 4000])
+def test_a_value_above_a_known_cost_is_not_called_converged(extent, monkeypatch):
+    """Errors as large as the bound, points that reach over many bounds, and two wrong ones.
+
+    What is small beside the cost matrix is large beside the cost there. A solver that is told to stop early
+    shows in a second what one of full accuracy met in minutes: a value that is no bound is called solved.
+    """
+    values = []
+
+    def hasty(matrix):
+        values.append(relax(matrix, accuracy=1e-2))
+        return values[-1]
+
+    monkeypatch.setattr(relaxation, "relax", hasty)
+    rng = np.random.default_rng(extent)
+    src = rng.uniform(-extent / 2, extent / 2, (6, 3))
+    noise = rng.normal(size=(6, 3))
+    dst = src @ tj.synthetic.draw_rotation(rng).T + noise / np.linalg.norm(noise, axis=1, keepdims=True)
+    dst[:2] = rng.uniform(-extent / 2, extent / 2, (2, 3))
+    found = tj.solve_rotation(src, dst, noise_bound=1.0, method="sdp", proof=None)
+    assert values[0].converged
+    if extent > 40:
+        assert values[0].value > 1.01 * found.cost
+    assert found.relaxation.converged == (values[0].value <= found.cost + 1e-3 * max(found.cost, 1))
+    assert found.relaxation.is_tight <= found.relaxation.converged

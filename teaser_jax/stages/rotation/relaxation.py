@@ -68,7 +68,7 @@ class RelaxationReport:
         gap: (cost of the rounded rotation - value) / cost [-].
         is_tight: Whether rank is one and the gap below a thousandth: then Theorem 13 calls the rotation the
             unique global optimum, as far as the solver's numbers go. The certificate does not rest on this.
-        converged: Whether the solver reached its tolerance.
+        converged: Whether the solver reached its tolerance, and a value that no known rotation undercuts.
         iterations: Of the solver.
     """
 
@@ -123,7 +123,17 @@ def solve_relaxation(m: Measurements) -> Rounded:
         turns, costs = jax.device_get(_polished(m, quats))
         # A candidate that is as good as any stays, whatever rounding says.
         best = int(np.argmin(costs + 1e-9 * costs[0] * (np.arange(len(costs)) > 0)))
-        return Rounded(turns[best], float(costs[best]), relaxed)
+        return Rounded(turns[best], float(costs[best]), _believed(relaxed, float(costs[best])))
+
+
+def _believed(relaxed: Relaxed, cost: float) -> Relaxed:
+    """Take back that the solver converged where its value lies above the cost of a rotation.
+
+    No lower bound does. Where points reach over hundreds of bounds and wrong ones are among them, a residual
+    that is small beside the cost matrix is large beside the cost.
+    """
+    possible = relaxed.value <= cost + RANK_TOLERANCE * max(cost, 1.0)
+    return relaxed._replace(converged=relaxed.converged and possible)
 
 
 _cost_matrix = jax.jit(cost_matrix)
