@@ -132,6 +132,13 @@ def _add_study(study: argparse.ArgumentParser) -> None:
         "--export", type=Path, metavar="DIR", help="write the problems as .npz shards, and solve nothing"
     )
     study.add_argument(
+        "--score", action="append", default=[], type=Path, metavar="NPZ",
+        help="answers of another program to the exported problems, one more method in table and figure; "
+        "again for more files. Arrays: method (its name), rotation (b, 3, 3), translation (b, 3), scale (b,) "
+        "if it is unknown, maybe seconds (b,); and study, seed, model, model_crc32, protocol, value, trial "
+        "of the shard. A pose of NaN is no answer. Give --runs, --quick, --seed, --model as with --export",
+    )  # fmt: skip
+    study.add_argument(
         "--cluster", nargs="?", const="", metavar="HOST:PORT,N,K",
         help="share the work among N processes, of which this is number K; alone, as Slurm or Open MPI say",
     )  # fmt: skip
