@@ -110,22 +110,27 @@ def _boxes(axes: Axes, results: Results, measure: Measure, methods: list[str]) -
     if measure.log:
         axes.set_yscale("log")
     for method in methods:
-        look = look_of(method)
-        color = look.color
-        for place, value in enumerate(results.values):
-            numbers = _drawn(results.measured(method, value, measure.column), measure)
-            if not len(numbers):
-                continue
-            axes.boxplot(
-                numbers, positions=[place + shifts[method]], widths=min(0.86 * width, 0.2),
-                patch_artist=True, manage_ticks=False,
-                boxprops={"facecolor": color, "edgecolor": color, "alpha": 0.75, "linewidth": 0.6},
-                medianprops={"color": INK, "linewidth": 0.9},
-                whiskerprops={"color": color, "linewidth": 0.8}, capprops={"color": color, "linewidth": 0.8},
-                flierprops={"marker": ".", "markersize": 2.5, "markeredgecolor": color},
-            )  # fmt: skip
-            axes.plot(place + shifts[method], np.median(numbers), zorder=3, **_marked(results, look, 5.0))
+        look, cells = look_of(method), _cells(results, method, measure)
+        if not cells:
+            continue
+        color, across = look.color, [place + shifts[method] for place in cells]
+        axes.boxplot(
+            list(cells.values()), positions=across, widths=min(0.86 * width, 0.2),
+            patch_artist=True, manage_ticks=False,
+            boxprops={"facecolor": color, "edgecolor": color, "alpha": 0.75, "linewidth": 0.6},
+            medianprops={"color": INK, "linewidth": 0.9},
+            whiskerprops={"color": color, "linewidth": 0.8}, capprops={"color": color, "linewidth": 0.8},
+            flierprops={"marker": ".", "markersize": 2.5, "markeredgecolor": color},
+        )  # fmt: skip
+        medians = [np.median(numbers) for numbers in cells.values()]
+        axes.plot(across, medians, linestyle="", zorder=3, **_marked(results, look, 5.0))
     _ticks(axes, results)
+
+
+def _cells(results: Results, method: str, measure: Measure) -> dict[int, np.ndarray]:
+    """Find what is drawn of a method, by the place of the cell; cells without a number are left out."""
+    every = (_drawn(results.measured(method, value, measure.column), measure) for value in results.values)
+    return {place: numbers for place, numbers in enumerate(every) if len(numbers)}
 
 
 def _shares(axes: Axes, results: Results) -> None:

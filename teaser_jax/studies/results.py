@@ -58,7 +58,7 @@ class Results:
 
     @property
     def methods(self) -> list[str]:
-        """The methods that the table has: the study's, those whose package is missing here, those of users."""
+        """The methods that the table has: the study's, those whose package is missing here, and users'."""
         order = [*dict.fromkeys([*(method.name for method in self.study.methods), *KNOWN])]
         there = sorted({method for method, _ in self._cells})
         return sorted(there, key=lambda name: order.index(name) if name in order else len(order))
