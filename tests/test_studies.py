@@ -281,8 +281,9 @@ def test_a_batch_is_timed_whole_however_few_trials_are_scored(monkeypatch):
         assert {row["together"] for row in rows} == {max(BATCH, len(trials))} == set(calls[-2:])
         times.append(rows[0]["seconds"])
     assert max(times) < 2 * min(times)
-    assert studied.timed_together(3, 10_000) == 10  # large problems fill a batch sooner
-    assert studied.timed_together(40, 1_000_000) == 40
+    assert studied.timed_together(3, 10_000, 1) == 10  # large problems fill a batch sooner
+    assert studied.timed_together(3, 100, 4) == 4 * BATCH  # a piece of it for each device
+    assert studied.timed_together(40, 1_000_000, 1) == 40
 
 
 def test_what_another_library_raises_is_a_row(tmp_path, monkeypatch):

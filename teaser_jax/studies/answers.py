@@ -20,7 +20,7 @@ from teaser_jax.studies.study import Study
 from teaser_jax.studies.table import written
 from teaser_jax.studies.trials import Origin, StudyError, Trial
 
-COPIED = (*ORIGIN, "value", "trial")  # from the shard
+COPIED = (*ORIGIN, "value", "trial")  # from the shard into the file of answers
 PARTS = {"rotation": (3, 3), "translation": (3,), "scale": ()}  # of a pose
 MEASURED_BY = {"rotation": "rotation_deg", "translation": "translation", "scale": "scale_error"}
 SQUARE_WITHIN = 1e-3  # how far R R^T may be from I: room for rotations in few digits

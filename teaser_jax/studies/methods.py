@@ -34,7 +34,7 @@ from teaser_jax.studies.trials import Trial
 Row: TypeAlias = dict[str, Any]
 OURS = "teaser_jax"
 LIMIT = "least squares on the true inliers"
-BATCH, BATCH_MATCHES = 128, 100_000  # a batch that is timed has so many problems, or matches in all
+BATCH, BATCH_MATCHES = 128, 100_000  # problems, and at most so many matches, fill a device that is timed
 SDP_MOST = 21  # right matches whose chain the semidefinite relaxation takes in some seconds
 VOTES: dict[Criterion, str] = {"tls": "TLS", "consensus": "consensus maximisation"}
 STAGES = {
@@ -250,7 +250,8 @@ def _in_batches(
     measure: Callable[[Trial, Solution], Row] | None = None,
 ) -> list[Row]:
     problems = [trial.for_solver() for trial in trials]
-    count = timed_together(len(trials), len(problems[0].src))
+    devices = jax.device_count() if mesh is None else mesh.size
+    count = timed_together(len(trials), len(problems[0].src), devices)
     solve = partial(solve_batch, [*islice(cycle(problems), count)], settings, mesh=mesh)
     solve()  # compiles, for every size of clique that comes
     found, seconds = _timed(solve)
@@ -258,9 +259,9 @@ def _in_batches(
     return [(measure or _judged)(t, s) | timing for t, s in zip(trials, found, strict=False)]
 
 
-def timed_together(trials: int, matches: int) -> int:
-    """Count the problems of a timed batch: all trials, and so many more that the time is that of a batch."""
-    return max(trials, min(BATCH, BATCH_MATCHES // matches))
+def timed_together(trials: int, matches: int, devices: int) -> int:
+    """Count the problems of a timed batch: all trials, and so many more that every device is busy."""
+    return max(trials, devices * min(BATCH, BATCH_MATCHES // matches))
 
 
 def _judged(trial: Trial, found: Solution) -> Row:
