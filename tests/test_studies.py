@@ -43,8 +43,9 @@ def keys(rows, sweep="outlier_rate"):
 
 
 def without_times(rows):
+    """Leave out the time, and of how many problems it is a share: more devices take more at once."""
     return sorted(
-        ({k: v for k, v in row.items() if k != "seconds"} for row in rows),
+        ({k: v for k, v in row.items() if k not in ("seconds", "together")} for row in rows),
         key=lambda row: (row["outlier_rate"], row["trial"], row["method"]),
     )
 

@@ -42,7 +42,7 @@ def label(axes: Axes, title: str, x: str, y: str, *, counts: bool = True) -> Non
     axes.set_title(title, fontsize=10, color=INK)
     axes.set_xlabel(x, fontsize=9, color=INK)
     axes.set_ylabel(y, fontsize=9, color=INK)
-    axes.tick_params(labelsize=8, colors=INK)
+    axes.tick_params(which="both", labelsize=8, colors=INK)
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=counts, steps=[1, 2, 5, 10]))
     without_spines(axes, "top", "right")
 
