@@ -44,7 +44,7 @@ ORDER = [
     "plots.style", "plots.answer", "plots.stages", "plots.proofs", "plots.learning",
     "studies.peers", "studies.trials", "studies.methods", "studies.study", "studies.draws",
     "studies.catalogue", "studies.shards",
-    "studies.table", "studies.results", "studies.figures", "studies.run",
+    "studies.looks", "studies.table", "studies.answers", "studies.results", "studies.figures", "studies.run",
     "cli.endings", "cli.places", "cli.report", "cli.register", "cli.demo", "cli.study", "cli.arguments",
     "__main__",
 ]  # fmt: skip

@@ -29,7 +29,8 @@ from teaser_jax.studies import (
     run_study,
     studies,
 )
-from teaser_jax.studies.methods import Method
+from teaser_jax.studies import methods as studied
+from teaser_jax.studies.methods import BATCH, Method
 from teaser_jax.studies.table import Table
 
 TLS = ["TLS"]
@@ -42,8 +43,9 @@ def keys(rows, sweep="outlier_rate"):
 
 
 def without_times(rows):
+    """Leave out the time, and of how many problems it is a share: more devices take more at once."""
     return sorted(
-        ({k: v for k, v in row.items() if k != "seconds"} for row in rows),
+        ({k: v for k, v in row.items() if k not in ("seconds", "together")} for row in rows),
         key=lambda row: (row["outlier_rate"], row["trial"], row["method"]),
     )
 
@@ -187,6 +189,10 @@ def test_another_model_or_seed_needs_another_folder(tmp_path):
     cloud = Model("box", np.random.default_rng(0).random((200, 3)))
     with pytest.raises(FileError, match="model 'teapot', and 'box' is asked for"):
         run_study("translation", tmp_path, runs=1, quick=True, model=cloud)
+    run_study("translation", tmp_path / "box", runs=1, quick=True, model=cloud, methods=TLS)
+    other = Model("box", cloud.shape + 1)
+    with pytest.raises(FileError, match="model crc32 '.{8}', and '.{8}' is asked for: name another folder"):
+        run_study("translation", tmp_path / "box", runs=1, quick=True, model=other)
 
 
 def test_one_writer_at_a_time(tmp_path):
@@ -235,7 +241,8 @@ def test_answers_are_right_and_all_methods_see_the_same_problems(quick):
     for value in results.values:
         limit, ours = (results.measured(m, value, "rotation_deg") for m in results.methods)
         np.testing.assert_allclose(ours, limit, rtol=0.2)
-    assert results.measured("teaser_jax", 0.5, "together").tolist() == [2, 2]
+    assert results.measured("teaser_jax", 0.5, "together").tolist() == [BATCH, BATCH]
+    assert results.label("teaser_jax") == f"teaser_jax (batches of {BATCH})"
 
 
 @pytest.mark.long
@@ -245,10 +252,39 @@ def test_the_figure_is_drawn_and_the_page_stands_alone(quick):
     page = (place / "figure.html").read_text()
     assert "least squares on the true inliers" in page
     assert "rotation error [deg]" in page
+    assert f"teaser_jax (batches of {BATCH})" in page
     assert not re.search(r"<(script|link|img)[^>]{0,200}(src|href)=", page)
     about = json.loads((place / "about.json").read_text())
     assert about["model"] == "teapot"
     assert about["made_with"][0]["versions"]["jax"]
+
+
+def test_a_batch_is_timed_whole_however_few_trials_are_scored(monkeypatch):
+    """Regression: three problems of a quick study paid for a whole run, and the batch looked slow."""
+    calls = []
+
+    def solve_batch(problems, settings, mesh):
+        calls.append(len(problems))
+        time.sleep(0.02 * -(-len(problems) // 64))  # as a compiled program does, 64 problems a run
+        return problems
+
+    monkeypatch.setattr(studied, "solve_batch", solve_batch)
+    monkeypatch.setattr(
+        studied, "_judged", lambda trial, problem: {"own": np.array_equal(trial.problem.src, problem.src)}
+    )
+    study = studies()["known-scale"]
+    few = [study.trial(0, 0.5, k, Model()) for k in range(3)]
+    times = []
+    for trials in (few[:1], few, few * 43):
+        rows = studied.in_batches().run(trials, None)
+        assert len(rows) == len(trials)
+        assert all(row["own"] for row in rows)
+        assert {row["together"] for row in rows} == {max(BATCH, len(trials))} == set(calls[-2:])
+        times.append(rows[0]["seconds"])
+    assert max(times) < 2 * min(times)
+    assert studied.timed_together(3, 10_000, 1) == 10  # large problems fill a batch sooner
+    assert studied.timed_together(3, 100, 4) == 4 * BATCH  # a piece of it for each device
+    assert studied.timed_together(40, 1_000_000, 1) == 40
 
 
 def test_what_another_library_raises_is_a_row(tmp_path, monkeypatch):

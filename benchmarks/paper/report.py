@@ -141,7 +141,8 @@ def _section(results: Results, place: Path) -> Iterator[str]:
         having = [m for m in results.methods if results.has(m, measure.column)]
         yield f"Median {measure.label}."
         yield ""
-        yield from _grid(results, having, partial(_number, results, measure=measure))
+        label = results.label if measure.column == "seconds" else str
+        yield from _grid(results, having, partial(_number, results, measure=measure), label)
     failed = [row for row in results.rows if "error" in row]
     if failed:
         first = failed[0]
@@ -163,14 +164,19 @@ def _made_with(environments: list[dict[str, Any]]) -> Iterator[str]:
         yield ""
 
 
-def _grid(results: Results, methods: list[str], cell: Callable[[str, Number], str]) -> Iterator[str]:
+def _grid(
+    results: Results,
+    methods: list[str],
+    cell: Callable[[str, Number], str],
+    label: Callable[[str], str] = str,
+) -> Iterator[str]:
     values = results.values
     heads = [f"{v:g}" if results.study.sweep == MATCHES else f"{v:.0%}" for v in values]
     yield f"| {LABELS[results.study.sweep]} | " + " | ".join(heads) + " |"
     yield "|---" * (len(values) + 1) + "|"
     for method in methods:
         cells = [cell(method, v) if results.of(method, v) else "" for v in values]
-        yield f"| {method} | " + " | ".join(cells) + " |"
+        yield f"| {label(method)} | " + " | ".join(cells) + " |"
     yield ""
 
 

@@ -127,10 +127,21 @@ def _add_study(study: argparse.ArgumentParser) -> None:
     study.add_argument(
         "--method", action="append", metavar="M", help="one that takes part, again for more (default: all)"
     )
-    study.add_argument("--quick", action="store_true", help="a few cells of three runs: two minutes a study")
+    study.add_argument(
+        "--quick",
+        action="store_true",
+        help="a few cells of three runs: two minutes a study",
+    )
     study.add_argument(
         "--export", type=Path, metavar="DIR", help="write the problems as .npz shards, and solve nothing"
     )
+    study.add_argument(
+        "--score", action="append", default=[], type=Path, metavar="NPZ",
+        help="answers of another program to the exported problems, one more method in table and figure; "
+        "again for more files. Arrays: method (its name), rotation (b, 3, 3), translation (b, 3), scale (b,) "
+        "if it is unknown, maybe seconds (b,); and study, seed, model, model_crc32, protocol, value, trial "
+        "of the shard. A pose of NaN is no answer. Give --runs, --quick, --seed, --model as with --export",
+    )  # fmt: skip
     study.add_argument(
         "--cluster", nargs="?", const="", metavar="HOST:PORT,N,K",
         help="share the work among N processes, of which this is number K; alone, as Slurm or Open MPI say",

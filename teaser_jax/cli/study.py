@@ -43,11 +43,17 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.name == LIST:
         return _list()
     names = list(studies()) if arguments.name == ALL else [named_study(arguments.name).name]
+    if arguments.score and arguments.name == ALL:
+        raise StudyError("--score measures the answers to one study: name it instead of 'all'")
     model = TEAPOT if arguments.model == "procedural" else read_model(arguments.model)
     for name in names:
         if arguments.export is not None:
             if arguments.method:
                 raise StudyError("--method chooses solvers: --export solves nothing")
+            if arguments.score:
+                raise StudyError(
+                    "--score measures answers: --export writes the problems, before there are any"
+                )
             _export(name, model, arguments)
         else:
             _go_on(name, model, arguments)
@@ -101,7 +107,7 @@ def _go_on(name: str, model: Model, arguments: argparse.Namespace) -> None:
         place = run_study(
             name, arguments.folder,
             runs=arguments.runs, seed=arguments.seed, model=model, methods=arguments.method,
-            quick=arguments.quick, progress=jax.process_index() == 0,
+            quick=arguments.quick, score=arguments.score, progress=jax.process_index() == 0,
         )  # fmt: skip
     except KeyboardInterrupt:
         print(f"\nteaser-jax: {name} is not finished: the same command goes on where it was", file=sys.stderr)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,24 +42,27 @@ def label(axes: Axes, title: str, x: str, y: str, *, counts: bool = True) -> Non
     axes.set_title(title, fontsize=10, color=INK)
     axes.set_xlabel(x, fontsize=9, color=INK)
     axes.set_ylabel(y, fontsize=9, color=INK)
-    axes.tick_params(labelsize=8, colors=INK)
+    axes.tick_params(which="both", labelsize=8, colors=INK)
     axes.yaxis.set_major_locator(MaxNLocator("auto", integer=counts, steps=[1, 2, 5, 10]))
     without_spines(axes, "top", "right")
 
 
-def legend(figure: Figure, colors: dict[str, str]) -> None:
-    """Say below the panels what each colour is."""
+def legend(
+    figure: Figure, colors: dict[str, str], markers: Mapping[str, str] = {}, columns: int = LEGEND_COLUMNS
+) -> None:
+    """Say below the panels what each colour is, and each marker that is no disk."""
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=color, marker="" if name == "rejected matches" else "o", markersize=5,
-               linestyle="-" if name in ("inliers", "rejected matches") else "", label=name)
+        Line2D([], [], color=color, markersize=5, label=name,
+               marker="" if name == "rejected matches" else markers.get(name, "o"),
+               linestyle="-" if name in ("inliers", "rejected matches") else "")
         for name, color in colors.items()
     ]  # fmt: skip
     figure.legend(
         handles=handles,
         loc="outside lower center",
-        ncols=min(len(handles), LEGEND_COLUMNS),
+        ncols=min(len(handles), columns),
         frameon=False,
         fontsize=9,
     )

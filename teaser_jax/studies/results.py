@@ -13,6 +13,7 @@ import numpy as np
 from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError
 from teaser_jax.studies.catalogue import studies
+from teaser_jax.studies.looks import KNOWN
 from teaser_jax.studies.methods import Row
 from teaser_jax.studies.study import Study
 from teaser_jax.studies.table import read_table, written
@@ -57,10 +58,19 @@ class Results:
 
     @property
     def methods(self) -> list[str]:
-        """The methods that the table has, in the study's order, then those whose package is missing here."""
-        there = dict.fromkeys(method for method, _ in self._cells)
-        order = [method.name for method in self.study.methods]
+        """The methods that the table has: the study's, those whose package is missing here, and users'."""
+        order = [*dict.fromkeys([*(method.name for method in self.study.methods), *KNOWN])]
+        there = sorted({method for method, _ in self._cells})
         return sorted(there, key=lambda name: order.index(name) if name in order else len(order))
+
+    def label(self, method: str) -> str:
+        """Name a method for a reader, who sees of how large batches the time is a share, if it is one."""
+        together = sorted(
+            {int(row["together"]) for row in self.rows if row["method"] == method and "together" in row}
+        )
+        if not together:
+            return method
+        return f"{method} (batches of {' to '.join(map(str, dict.fromkeys((together[0], together[-1]))))})"
 
     def of(self, method: str, value: Number) -> list[Row]:
         """Return the rows of one method and cell."""

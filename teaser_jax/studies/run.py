@@ -7,6 +7,8 @@ import os
 import platform
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import asdict
+from functools import partial
 from importlib import metadata
 from itertools import groupby
 from pathlib import Path
@@ -18,16 +20,16 @@ from jax.sharding import Mesh
 from teaser_jax.engine.processes import all_of, check_agreement
 from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.io import FileError, one_line, os_errors_named, replacing
+from teaser_jax.studies.answers import read_answers
 from teaser_jax.studies.catalogue import studies
 from teaser_jax.studies.figures import check_drawing, draw_study
 from teaser_jax.studies.methods import Method, Row
 from teaser_jax.studies.results import ABOUT, TABLE
 from teaser_jax.studies.study import Study
 from teaser_jax.studies.table import Table, written
-from teaser_jax.studies.trials import TEAPOT, Model, StudyError, Trial, check_seed
+from teaser_jax.studies.trials import TEAPOT, Model, Origin, StudyError, Trial, check_seed
 
 PACKAGES = ("teaser-jax", "jax", "jaxlib", "numpy", "numba", "scs", "kiss-matcher", "open3d-cpu", "open3d")
-PROTOCOL = 1  # raised when a study draws other problems for the same seed
 
 
 class Todo(NamedTuple):
@@ -49,6 +51,7 @@ def run_study(
     mesh: Mesh | None = None,
     quick: bool = False,
     progress: bool = False,
+    score: str | Path | Sequence[str | Path] = (),
 ) -> Path:
     """Run one of the paper's studies, or go on with it, and draw its figure.
 
@@ -65,22 +68,29 @@ def run_study(
         methods: Names of those that take part; None: all, in a quick study without the slow ones.
         mesh: Devices for the methods that take problems in batches; None: all. Under ``jax.distributed``
             every process calls, shares the work, and the first one writes.
-        quick: A few cells of three runs each, in two minutes.
+        quick: A few cells of three runs each, in two minutes. What solves in batches is timed on a large one,
+            which repeats these problems; the legend says how many.
         progress: Show a bar with the time left.
+        score: Files with answers of other programs to the problems of ``save_trials``; each program becomes
+            one more method. ``answers.read_answers`` describes the format.
 
     Returns:
         The folder of the study.
 
     Raises:
         StudyError: On names, runs or seeds that make no sense; it is a ValueError.
-        FileError: If the folder holds a study of another model or seed, or cannot be written.
+        FileError: If the folder holds a study of another model or seed, or other answers of a method that is
+            scored, or cannot be written; on files to score that cannot be used.
         ImportError: Without the extra ``studies``, before anything is computed.
     """
     check_drawing()
     study, seed = named_study(name), check_seed(seed)
-    work = _Work(study, seed, model, study.cells(runs, quick=quick), _chosen(study, methods, quick), mesh)
+    files = [score] if isinstance(score, str | Path) else list(score)
+    cells, chosen = study.cells(runs, quick=quick), _chosen(study, methods, quick)
+    scored = read_answers(files, study, study.origin(seed, model), cells)
+    work = _Work(study, seed, model, cells, chosen, mesh, scored)
     work.check()
-    asked = (name, runs, seed, model.name, model.shape, methods, quick)
+    asked = (name, runs, seed, model.name, model.shape, methods, quick, [str(path) for path in files])
     check_agreement("run_study", asked, error=StudyError)
     place = Path(folder) / name
     _fill(place, work, progress)
@@ -98,6 +108,7 @@ class _Work(NamedTuple):
     cells: list[tuple[Number, range]]
     methods: list[Method]
     mesh: Mesh | None
+    scored: list[Method]
 
     def trial(self, value: Number, number: int = 0) -> Trial:
         return self.study.trial(self.seed, value, number, self.model)
@@ -111,7 +122,7 @@ class _Work(NamedTuple):
         """List the runs that are missing, of the methods that the first trial of a cell suits."""
         for value, numbers in self.cells:
             first = self.trial(value)
-            for method in self.methods:
+            for method in (*self.methods, *self.scored):
                 missing = [k for k in numbers if (written(value), k, method.name) not in known]
                 if missing and method.suits(first):
                     yield Todo(value, method, missing)
@@ -135,6 +146,7 @@ def _fill(place: Path, work: _Work, progress: bool) -> None:
         if jax.process_index() == 0:
             try:
                 table = stack.enter_context(_opened(place, work))
+                _check_scored(table, work)
                 known = {_key(row, work.study) for row in table.rows}
             except FileError as error:
                 failure = str(error)
@@ -150,15 +162,24 @@ def _fill(place: Path, work: _Work, progress: bool) -> None:
             bar.update(len(rows))
 
 
+def _check_scored(table: Table, work: _Work) -> None:
+    """Raise FileError if the table has other answers of a method that is scored: those rows would stay."""
+    before = {_key(row, work.study): table.fields(row) for row in table.rows}
+    for method in work.scored:
+        for value, numbers in work.cells:
+            there = [k for k in numbers if (written(value), k, method.name) in before]
+            trials = [work.trial(value, k) for k in there]
+            for row in _named(work.study, method, trials, method.run(trials, None)):
+                if before[_key(row, work.study)] != table.fields(row):
+                    raise FileError(
+                        f"{table.path}: holds other answers of {method.name!r}: give the method another "
+                        "name in the file, or remove its rows from the table."
+                    )
+
+
 def _answers(study: Study, method: Method, trials: list[Trial], mesh: Mesh | None) -> Iterator[list[Row]]:
     """Ask a method about trials of one cell, together or one by one, shared among the processes."""
-
-    def named(some: list[Trial], measured: list[Row]) -> list[Row]:
-        return [
-            {study.sweep: t.value, "trial": t.number, "method": method.name} | row
-            for t, row in zip(some, measured, strict=True)
-        ]
-
+    named = partial(_named, study, method)
     if method.together:
         yield named(trials, method.run(trials, mesh))
     elif jax.process_count() == 1:
@@ -168,6 +189,14 @@ def _answers(study: Study, method: Method, trials: list[Trial], mesh: Mesh | Non
         share = trials[jax.process_index() :: jax.process_count()]
         rows = [row for trial in share for row in named([trial], _guarded(method, trial))]
         yield [row for some in all_of(rows) for row in some]
+
+
+def _named(study: Study, method: Method, trials: list[Trial], measured: list[Row]) -> list[Row]:
+    """Say in rows of which cell, run and method they are."""
+    return [
+        {study.sweep: t.value, "trial": t.number, "method": method.name} | row
+        for t, row in zip(trials, measured, strict=True)
+    ]
 
 
 def _guarded(method: Method, trial: Trial) -> list[Row]:
@@ -187,16 +216,13 @@ def _key(row: Row, study: Study) -> tuple[Any, ...]:
 
 def _opened(place: Path, work: _Work) -> Table:
     """Open the table of a study in its folder, which must be of the same problems; note this environment."""
-    study = work.study
-    about = {
-        "study": study.name, "figure": study.figure, "title": study.title, "sweep": study.sweep,
-        "model": work.model.name, "seed": work.seed, "protocol": PROTOCOL,
-    }  # fmt: skip
+    study, origin = work.study, work.study.origin(work.seed, work.model)
+    about = {"figure": study.figure, "title": study.title, "sweep": study.sweep, **asdict(origin)}
     path = place / ABOUT
     with os_errors_named(place, "cannot be written"):
         place.mkdir(parents=True, exist_ok=True)
         try:
-            made_with = _made_with(place, about)
+            made_with = _made_with(place, origin)
         except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
             raise FileError(f"{path}: is no description of a study ({error}): remove the folder.") from error
         table = Table(place / TABLE, (study.sweep, "trial", "method", *study.columns, "error"))
@@ -205,18 +231,18 @@ def _opened(place: Path, work: _Work) -> Table:
         return table
 
 
-def _made_with(place: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
+def _made_with(place: Path, origin: Origin) -> list[dict[str, Any]]:
     """List the environments that have worked on a study, and this one; FileError if it is another study."""
     path, here = place / ABOUT, environment()
     if not path.exists():
         return [here]
     before = json.loads(path.read_text(encoding="utf-8"))
-    for key in ("study", "model", "seed", "protocol"):
-        if before.get(key) != about[key]:
-            raise FileError(
-                f"{place}: holds a study of {key} {before.get(key)!r}, and {about[key]!r} is asked for: "
-                "name another folder."
+    if differs := origin.unlike(before):
+        raise FileError(
+            "{}: holds a study of {} {!r}, and {!r} is asked for: name another folder.".format(
+                place, *differs
             )
+        )
     made_with: list[dict[str, Any]] = before["made_with"]
     return [*made_with, *([] if here in made_with else [here])]
 

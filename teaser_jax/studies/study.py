@@ -10,7 +10,7 @@ import numpy as np
 from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.studies.methods import Method, Row
-from teaser_jax.studies.trials import Draw, Model, StudyError, Trial, seed_of
+from teaser_jax.studies.trials import Draw, Model, Origin, StudyError, Trial, seed_of
 
 OUTLIERS, OVERLAP, MATCHES = "outlier_rate", "overlap", "n"  # what can be swept
 LABELS = {OUTLIERS: "wrong matches", OVERLAP: "overlap", MATCHES: "matches"}
@@ -80,6 +80,10 @@ class Study:
         count = usual if runs is None else whole_number("runs", runs, 1, error=StudyError)
         return [(value, range(count)) for value in (self.quick_values if quick else self.values)]
 
+    def origin(self, seed: int, model: Model) -> Origin:
+        """Say what the problems of a seed and a model are drawn from."""
+        return Origin(self.name, seed, model.name, model.crc32)
+
     def trial(self, seed: int, value: Number, number: int, model: Model) -> Trial:
         """Draw one problem of a cell; the same for the same arguments, on every machine.
 
@@ -96,7 +100,8 @@ class Study:
             problem = self.draw(seed_of(self.name, seed, value, number), value, model)
         except ValueError as error:
             raise StudyError(f"{self.name} cannot draw from the model {model.name!r}: {error}") from error
-        return Trial(value, number, problem, self.scale)
+        origin = self.origin(seed, model)
+        return Trial(value, number, problem, self.scale, origin)
 
 
 def below(**limits: Number) -> Callable[[Row], bool]:

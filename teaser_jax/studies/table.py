@@ -62,7 +62,11 @@ class Table:
         Raises:
             FileError: If they cannot be written; the rows before are safe.
         """
-        self._write([[_text(row.get(column)) for column in self.columns] for row in rows])
+        self._write([self.fields(row) for row in rows])
+
+    def fields(self, row: dict[str, Any]) -> list[str]:
+        """Write the values of a row as the fields of the table, in its order."""
+        return [_text(row.get(column)) for column in self.columns]
 
     def _mend(self) -> None:
         """Cut what a killed program left of a row; write the header of a new file."""

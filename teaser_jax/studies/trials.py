@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 from zlib import crc32
+
+import numpy as np
 
 from teaser_jax.files.models import read_shape
 from teaser_jax.ground.arrays import Number
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.problem import Problem, host_problem
-from teaser_jax.synthetic import Shape, SyntheticProblem
+from teaser_jax.synthetic import Shape, SyntheticProblem, Triangles
+
+PROTOCOL = 1  # raised when a study draws other problems for the same seed
 
 
 class StudyError(ValueError):
@@ -31,8 +36,46 @@ class Model:
     name: str = "teapot"
     shape: Shape = None
 
+    @cached_property
+    def crc32(self) -> str:
+        """The checksum of the shape tells models of one name apart; empty for the teapot."""
+        if self.shape is None:
+            return ""
+        arrays = self.shape if isinstance(self.shape, Triangles) else (self.shape,)
+        return f"{crc32(b''.join(np.asarray(x, np.float64).tobytes() for x in arrays)):08x}"
+
 
 TEAPOT = Model()
+
+
+@dataclass(frozen=True)
+class Origin:
+    """An ``Origin`` says what the problems of a study are drawn from: shards, answers and tables carry it.
+
+    Attributes:
+        study: The name of the study.
+        seed: The seed of the whole study.
+        model: The name of the model.
+        model_crc32: The checksum of its points, see ``Model``.
+        protocol: The version of the drawing.
+    """
+
+    study: str
+    seed: int
+    model: str
+    model_crc32: str
+    protocol: int = PROTOCOL
+
+    def unlike(self, other: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+        """Find the first part that differs from another origin: its name, theirs, ours; None if none does.
+
+        What was written before the checksum of the points was kept lacks it: that is no difference.
+        """
+        for key, ours in asdict(self).items():
+            theirs = other.get(key, ours if key == "model_crc32" else None)
+            if theirs != ours:
+                return key.replace("_", " "), theirs, ours
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +87,14 @@ class Trial:
         number: The number of the run in its cell; it and the value seed the problem.
         problem: Matches and truth.
         scale: The known scale [-], or None where methods must find it.
+        origin: The study, seed and model that it is drawn from; None where nobody knows.
     """
 
     value: Number
     number: int
     problem: SyntheticProblem
     scale: float | None = 1.0
+    origin: Origin | None = None
 
     def for_solver(self) -> Problem:
         """Return the matches without the truth, in float64 numpy."""
