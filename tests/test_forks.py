@@ -14,7 +14,6 @@ START = """
 import multiprocessing, warnings
 import jax, numpy as np
 import teaser_jax as tj
-from teaser_jax import learn
 warnings.simplefilter("ignore")  # JAX warns at each fork that it will hang
 points = np.random.default_rng(0).normal(size=(20, 3))
 fork = multiprocessing.get_context("fork").Pool
@@ -33,6 +32,7 @@ def refused(name):
     return False
 """
 DOORS = """
+from teaser_jax import learn
 answer, key = register(), jax.random.key(0)
 stated = tj.make_problem(points, points, noise_bound=0.1)
 host = tj.host_problem(points, points, noise_bound=0.1)
@@ -87,7 +87,7 @@ def test_every_door_refuses_a_child_of_a_process_that_used_the_package():
 @pytest.mark.parametrize(
     "use",
     [
-        "jax.numpy.zeros(3)",
+        "jax.numpy.zeros(3)",  # and nothing of this package but its name
         # A JAX that cannot be asked whether it has run: what the package itself did is known.
         "del jax._src.xla_bridge.backends_are_initialized; register()",
     ],
