@@ -9,6 +9,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import teaser_jax.ground.forks  # noqa: F401  watches for forks from the import on
+
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:  # for editors and type checkers: at run time the table below is asked

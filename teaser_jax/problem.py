@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax import reading
 from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
+from teaser_jax.ground.forks import check_fork
 
 
 @jax.tree_util.register_dataclass
@@ -84,6 +85,7 @@ def make_problem(
 
 def _on_device(array: AnyArray) -> Array:
     """Put an array onto the device, on purpose: a guard against transfers is not for it."""
+    check_fork()
     return array if isinstance(array, jax.Array) else jax.device_put(array)
 
 
@@ -214,6 +216,8 @@ def stack_problems(problems: Iterable[Problem]) -> Problem:
     sizes = [p.pairs.shape[0] for p in problems if p.pairs is not None]
     m = max(sizes, default=None)
     on_host = not any(isinstance(x, jax.Array) for x in jax.tree.leaves(problems))
+    if not on_host:
+        check_fork()
     stack = np.stack if on_host else jnp.stack
     return jax.tree.map(lambda *x: stack(x), *[pad_problem(p, n, m) for p in problems])
 

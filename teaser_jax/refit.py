@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray, is_traced
 from teaser_jax.ground.flags import as_on_the_host
+from teaser_jax.ground.forks import check_fork
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean
 from teaser_jax.rows import in_rows
@@ -110,7 +111,8 @@ def widened(problem: Problem, widening: Float[AnyArray, ""]) -> Problem:
 
 
 def check_problem(problem: Any) -> None:
-    """Check that ``problem`` is one problem. Raises ValueError."""
+    """Check that ``problem`` is one problem. Raises ValueError, and RuntimeError where nothing can be run."""
+    check_fork()
     if not isinstance(problem, Problem):
         raise ValueError(
             f"received {type(problem).__name__} for a problem: make one with make_problem(src, dst, "

@@ -11,6 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from teaser_jax.ground.forks import check_fork
+
 AnyArray: TypeAlias = Any  # numpy's on the host, JAX's on the device: what lives on both sides
 Number: TypeAlias = float | int | np.floating | np.integer
 
@@ -53,6 +55,7 @@ def is_traced(*values: Any) -> bool:
 
 def inside_jit() -> bool:
     """Tell whether this code runs while JAX traces a program, so that even constants become tracers."""
+    check_fork()
     with jax.transfer_guard("allow"):
         return isinstance(jnp.zeros(()), jax.core.Tracer)
 
@@ -108,6 +111,7 @@ def at_least_float32(values: AnyArray) -> Float[Array, "..."]:
     Raises:
         ValueError: For complex numbers.
     """
+    check_fork()
     values = jnp.asarray(values)
     if jnp.issubdtype(values.dtype, jnp.complexfloating):
         raise ValueError("complex numbers were received: points are real.")

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 
 import jax
 
+from teaser_jax.ground.forks import check_fork
+
 
 @contextmanager
 def as_on_the_host() -> Iterator[None]:
@@ -15,7 +17,11 @@ def as_on_the_host() -> Iterator[None]:
     The doors of the host send numpy arrays and fetch numpy arrays: a guard against transfers is not meant for
     them. Programs that run operation by operation (``jax_disable_jit``) take minutes, and NaN may stand in
     rows that nothing is read from.
+
+    Raises:
+        RuntimeError: In a child that was forked after JAX had run, where every program waits forever.
     """
+    check_fork()
     with (
         jax.enable_x64(True),
         jax.transfer_guard("allow"),

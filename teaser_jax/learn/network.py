@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, Real
 
 from teaser_jax.ground.arrays import AnyArray, Number, at_least_float32, squared_distances
 from teaser_jax.ground.checks import check_positive
+from teaser_jax.ground.forks import check_fork
 from teaser_jax.ground.masked import about_mean, mask_or_all
 
 BINS = 5
@@ -115,6 +116,7 @@ def init_network(
     Raises:
         ValueError: If one of these numbers is below 1 (``layers``: below 0).
     """
+    check_fork()
     if min(width, messages, size) < 1 or layers < 0:
         raise ValueError(
             f"width = {width}, messages = {messages}, size = {size}, layers = {layers}: expected 1 or more, "

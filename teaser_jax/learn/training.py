@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from teaser_jax.ground.arrays import AnyArray, Number
 from teaser_jax.ground.checks import check_positive
+from teaser_jax.ground.forks import check_fork
 from teaser_jax.ground.masked import masked_mean
 from teaser_jax.learn.losses import matching_loss, rotation_loss
 from teaser_jax.learn.matching import match
@@ -191,6 +192,7 @@ def train(
         ValueError: If sources and targets differ in number, nothing would be drawn, so few points that no
             pose could be trusted, or a bound, radius or temperature outside jit that is not above 0.
     """
+    check_fork()
     check_positive(noise_bound=noise_bound, radius=radius, temperature=temperature)
     _check_sizes(pairs, batch, points, steps)
     return _train(
