@@ -17,7 +17,7 @@ from teaser_jax.stages.clique.exact import ExactClique
 # A right match lies within its bound, wherever a cloud of this many bounds across is turned.
 FEWEST_BOUNDS = 3.0
 UNUSUAL = 100.0  # times the usual bound
-PAIRS = 100_000  # drawn for their ratios of lengths
+PAIRS = 100_000  # drawn for their ratios of lengths, or as many as there are
 CANDIDATES = 3
 # A dense graph must not make an answer that failed slow.
 BRIEFLY = Settings(clique=ExactClique(seconds=0.2))
@@ -98,7 +98,7 @@ def likely_scales(problem: Problem, usable: np.ndarray) -> list[float]:
 
     Pairs of right matches give the scale, those of wrong ones anything; ``CANDIDATES`` peaks are looked at.
     """
-    drawn = np.random.default_rng(0).choice(usable, (PAIRS, 2))
+    drawn = np.random.default_rng(0).choice(usable, (min(PAIRS, len(usable) ** 2), 2))
     a, b = (np.linalg.norm(x[drawn[:, 0]] - x[drawn[:, 1]], axis=1) for x in (problem.src, problem.dst))
     reach = np.sqrt(float(problem.cbar2)) * problem.noise_bound[drawn].sum(axis=1)
     tell = (a > 0) & (b > 2 * reach)  # shorter ones agree with too many scales
