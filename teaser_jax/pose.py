@@ -50,9 +50,9 @@ class Pose:
             matrix = matrix.astype(float)
         if not isinstance(matrix, jax.core.Tracer):
             _check_similarity(np.asarray(matrix, np.float64))
-        block = matrix[..., :3, :3]
-        scale = xp.cbrt(xp.linalg.det(block))
-        return cls(block / scale[..., None, None], matrix[..., :3, 3], scale)
+        size, block = _unit_block(matrix, xp)
+        root = xp.cbrt(xp.linalg.det(block))
+        return cls(block / root[..., None, None], matrix[..., :3, 3], size * root)
 
     @property
     def matrix(self) -> Float[AnyArray, "*batch 4 4"]:
@@ -134,10 +134,18 @@ def as_pose(value: Any) -> Pose:
     return Pose.from_matrix(matrix)
 
 
+def _unit_block(matrix: AnyArray, xp: Any) -> tuple[AnyArray, AnyArray]:
+    """Return the largest entry of s R and what is left of it: of tiny and huge scales the cube has no room."""
+    block = matrix[..., :3, :3]
+    largest = xp.max(xp.abs(block), axis=(-2, -1))
+    size = xp.where(largest > 0, largest, xp.ones_like(largest))
+    return size, block / size[..., None, None]
+
+
 def _check_similarity(matrix: np.ndarray) -> None:
     """Raise ValueError unless each matrix is [s R, t; 0, 1] with s above 0, to one in a thousand."""
-    block = matrix[..., :3, :3]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # entries that are not finite are refused below
+        _, block = _unit_block(matrix, np)
         scale2 = np.cbrt(np.linalg.det(block))[..., None, None] ** 2
         error = np.abs(np.swapaxes(block, -1, -2) @ block - scale2 * np.eye(3))
         proper = np.all(error <= 1e-3 * scale2) and np.all(np.linalg.det(block) > 0)

@@ -29,6 +29,7 @@ from teaser_jax.certify.traced import certify_traced, traced_mask
 from teaser_jax.ground.arrays import AnyArray, Placeholder, at_least_float32, is_traced
 from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.numbers import as_record
+from teaser_jax.reading import real_numbers
 from teaser_jax.settings import ROTATIONS, RotationMethod, check_record
 from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
 from teaser_jax.stages.rotation.pair_search import PairSearch
@@ -108,6 +109,7 @@ def solve_rotation(
     chosen: RotationMethod = as_record("method", method, ROTATIONS)
     check_record("method", chosen, ROTATIONS)
     one_of("proof", proof, (*get_args(CertifyMethod), None))
+    src, dst = real_numbers(src, "src"), real_numbers(dst, "dst")
     _check_vectors(src, dst)
     options = checked_options(tolerance, iterations, proof or "splitting", MAX_MEASUREMENTS)
     mask = np.ones(np.shape(src)[0], bool) if mask is None else mask
@@ -117,14 +119,12 @@ def solve_rotation(
 
 
 def _check_vectors(src: Any, dst: Any) -> None:
-    """Raise ValueError unless the vectors are (k, 3) both, and real."""
+    """Raise ValueError unless the vectors are (k, 3) both."""
     if np.shape(src) != np.shape(dst) or np.ndim(src) != 2 or np.shape(src)[1] != 3:
         raise ValueError(
             f"src and dst have shapes {np.shape(src)} and {np.shape(dst)}: expected (k, 3) both, rows are "
             "measurements."
         )
-    if any(np.iscomplexobj(x) for x in (src, dst) if not is_traced(x)):
-        raise ValueError("src and dst are real; complex numbers were received.")
 
 
 def _traced(

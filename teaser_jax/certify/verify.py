@@ -41,23 +41,36 @@ def verify(
         nothing: not that the rotation is bad.
 
     Raises:
-        ValueError: If measurements or rotation have shapes that do not fit.
+        ValueError: If measurements or rotation have shapes that do not fit, or an argument is no number.
     """
-    a, b, r, bound = (np.asarray(x, np.float64) for x in (src, dst, rotation, noise_bound))
+    a, b, r, bound, c2, within = (_numbers(x) for x in (src, dst, rotation, noise_bound, cbar2, tolerance))
     fits = a.shape == b.shape and a.shape[1:] == (3,) and r.shape == (3, 3) and bound.shape in ((), (len(a),))
-    if not fits:
-        raise ValueError(f"shapes {a.shape}, {b.shape}, {r.shape}, {bound.shape} do not fit.")
+    if not (fits and c2.shape == within.shape == ()):
+        shapes = ", ".join(str(x.shape) for x in (a, b, r, bound, c2, within))
+        raise ValueError(f"src, dst, rotation, noise_bound, cbar2 and tolerance do not fit: shapes {shapes}.")
     if not (
         np.all(bound > 0) and np.all(np.isfinite(r)) and np.all(np.isfinite(a)) and np.all(np.isfinite(b))
     ):
         return False
     a, b = a / np.broadcast_to(bound, len(a))[:, None], b / np.broadcast_to(bound, len(a))[:, None]
     try:
-        return _follows(a, b, r, certificate, float(cbar2), tolerance) and is_lower_bound(
-            a, b, float(cbar2), float(certificate.lower_bound), certificate.rotation, *certificate.dual
+        return _follows(a, b, r, certificate, float(c2), float(within)) and is_lower_bound(
+            a, b, float(c2), float(certificate.lower_bound), certificate.rotation, *certificate.dual
         )
     except (AttributeError, IndexError, TypeError, ValueError):  # not what a certificate looks like
         return False
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """Read numbers in float64; what a masked array hides becomes NaN, of which nothing is proved."""
+    try:
+        if isinstance(value, np.ma.MaskedArray):
+            value = np.ma.filled(value.astype(np.float64), np.nan)
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(
+            f"verify received {type(value).__name__} that holds no real numbers ({error})."
+        ) from None
 
 
 def _follows(a: np.ndarray, b: np.ndarray, r: np.ndarray, c: Any, cbar2: float, tolerance: float) -> bool:

@@ -13,8 +13,10 @@ from jaxtyping import Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.checks import check_positive, whole_number
+from teaser_jax.ground.numbers import NumberRule, checked_number
 from teaser_jax.pose import Pose
-from teaser_jax.synthetic.models import Points, Seed, Shape, sample_model
+from teaser_jax.synthetic.models import Points, Seed, Shape, generator, sample_model
 
 SIGMA = 0.01
 BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimensions
@@ -73,7 +75,7 @@ def random_problem(
 
     References: section XI-A.
     """
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     right = _right_matches(rng, n, scale, sigma, noise_bound, model, truth)
     return _with_outliers(rng, right, outlier_rate, lambda rows: in_ball(rng, len(rows), radius))
 
@@ -103,7 +105,7 @@ def descriptor_problem(
     Raises:
         ValueError: As ``random_problem``; and if the bound spans the target, so that no match could be wrong.
     """
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     right = _right_matches(rng, n, scale, sigma, noise_bound, model, truth)
     attractive = right.dst[rng.permutation(n)[: max(2, round(hubs * n))]]
     return _with_outliers(
@@ -140,7 +142,7 @@ def all_to_all(
     """
     if not 0 < overlap <= 1:
         raise ValueError(f"overlap is {overlap}: expected a share above 0, at most 1.")
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     whole = _right_matches(rng, n, 1.0, sigma, noise_bound, model, truth)
     kept = rng.permutation(n)[: max(1, round(overlap * n))]
     i, j = np.repeat(np.arange(n), len(kept)), np.tile(kept, n)
@@ -176,8 +178,11 @@ def _right_matches(
     model: Shape,
     truth: Pose | None,
 ) -> SyntheticProblem:
-    if n < 1 or sigma < 0:
-        raise ValueError(f"received n = {n} and sigma = {sigma}: expected n above 0, sigma 0 or above.")
+    whole_number("n", n, 1, what="the number of points")
+    checked_number("sigma", sigma, NumberRule(least=0))
+    check_positive(scale=scale)
+    if noise_bound is not None:
+        check_positive(noise_bound=noise_bound)
     bound = float(BOUND_PER_SIGMA * sigma if noise_bound is None else noise_bound)
     if bound < sigma:
         raise ValueError(f"noise_bound {bound} is below sigma {sigma}: most noise would be drawn again.")
@@ -195,7 +200,7 @@ def _with_outliers(
     rate: Number,
     draw: Callable[[Int[np.ndarray, " k"]], Points],
 ) -> SyntheticProblem:
-    if not 0 <= rate <= 1:
+    if checked_number("outlier_rate", rate, NumberRule(least=0)) > 1:
         raise ValueError(f"outlier_rate is {rate}: expected a share from 0 to 1.")
     n = len(right.src)
     wrong = rng.permutation(n)[: round(rate * n)]
