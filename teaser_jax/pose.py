@@ -71,6 +71,8 @@ class Pose:
     def apply(self, points: Any) -> Float[AnyArray, "... n 3"]:
         """Carry source points (rows) to the target frame. Raises ValueError unless they are (..., n, 3)."""
         points = as_array(points, "points")
+        if points.dtype.kind in "OSUMmbc" or points.dtype.names:
+            raise ValueError(f"points have dtype {points.dtype}: expected real numbers.")
         if points.dtype.kind in "iu":
             points = points.astype(float)
         if points.ndim < 2 or points.shape[-1] != 3:
@@ -121,7 +123,9 @@ def as_pose(value: Any) -> Pose:
         return value
     if isinstance(getattr(value, "pose", None), Pose):
         return value.pose
-    if np.ndim(value) < 2:
+    if not hasattr(value, "ndim"):
+        value = as_array(value, "the pose matrix")
+    if value.ndim < 2:
         raise ValueError(
             f"received {type(value).__name__} for a pose: give a Pose, the answer of register, or a matrix "
             "[s R, t; 0, 1] of shape (4, 4)."
@@ -135,7 +139,7 @@ def as_pose(value: Any) -> Pose:
 
 
 def _unit_block(matrix: AnyArray, xp: Any) -> tuple[AnyArray, AnyArray]:
-    """Return the largest entry of s R and what is left of it: of tiny and huge scales the cube has no room."""
+    """Return the largest entry of s R, and s R in units of it: tiny and huge scales have no cube."""
     block = matrix[..., :3, :3]
     largest = xp.max(xp.abs(block), axis=(-2, -1))
     size = xp.where(largest > 0, largest, xp.ones_like(largest))

@@ -114,7 +114,7 @@ def solve_rotation(
     options = checked_options(tolerance, iterations, proof or "splitting", MAX_MEASUREMENTS)
     mask = np.ones(np.shape(src)[0], bool) if mask is None else mask
     known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
-    how = _traced if is_traced(src, dst, known, tolerance) else _on_host
+    how = _traced if is_traced(src, dst, *known.values(), tolerance) else _on_host
     return how(src, dst, **known, method=chosen, options=options, certified=proof is not None)
 
 

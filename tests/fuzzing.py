@@ -21,13 +21,13 @@ SIZES = (8, 20, 32)  # one padded size, so that few programs are compiled
 # What stands in the place of an argument when something went wrong before.
 ODD = [
     None, "", "a", "nan", b"b", [], {}, (), set(), object(), len, slice(1), Ellipsis, True, False, 1j, "0.1",
-    0, -1, 1, 3, 2**31, 2**63, 10**400, -(10**400), 10**5000, 0.5, -0.0, 1e300, -1e300, 1e-300, 5e-324,
+    0, -1, 1, 3, 2**31, 2**63, 10**400, -(10**400), 0.5, -0.0, 1e300, -1e300, 1e-300, 5e-324,
     float("nan"), float("inf"), -float("inf"), [1, [2, 3]], [[1, 2], [3]], [None], ["a", "b"], [0.1, 0.2],
     np.float32(0.1), np.float64(0.1), np.int8(3), np.bool_(True), np.array(0.1), np.array([0.1]), np.zeros(0),
     np.zeros((0, 3)), np.zeros(3), np.zeros((3, 0)), np.zeros((3, 20)), np.zeros((20, 4)), np.zeros((20, 2)),
     np.zeros((2, 20, 3)), np.ones(20), np.ones(20, bool), np.arange(20), np.full((20, 3), np.nan),
     np.full((20, 3), np.inf), np.ones((20, 3), complex), np.ones((20, 3), "U1"), np.ones((20, 3), "S1"),
-    np.ones((20, 3), object), np.array(None), np.array("a"), np.datetime64("2020"), np.timedelta64(1),
+    np.ones((20, 3), object), np.array(None), np.array("a"),
     np.zeros((20, 3), "datetime64[s]"), np.zeros((20, 3), np.longdouble), np.zeros((20, 3), ">f4"),
     np.zeros(20, [("x", float)]), np.zeros(20, [("x", float), ("y", float), ("z", float)]),
     np.ma.masked_all((20, 3)), np.ma.masked_equal(np.eye(20, 3), 1), np.ma.masked,
@@ -222,15 +222,11 @@ def outcome(call: Callable[[], Any], told: Any, *refusals: type[Exception]) -> A
     """
     try:
         return call()
-    except refusals or (ValueError,) as error:
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        own = where.filename.startswith(PACKAGE)
-        words = str(error)
-        assert own and len(words) > 20 and "\n" not in words.strip(), (
-            f"{told!r}: bare {type(error).__name__}: {words[:300]} ({where.filename}:{where.lineno})"
-        )
-        return None
     except BaseException as error:
+        where, words = traceback.extract_tb(error.__traceback__)[-1], str(error)
+        documented = isinstance(error, refusals or ValueError) and where.filename.startswith(PACKAGE)
+        if documented and len(words) > 20 and "\n" not in words:
+            return None
         error.add_note(f"the fuzz was at {told!r}")
         raise
 
@@ -265,6 +261,7 @@ def stacked(problems: list[tj.Problem]) -> tj.Problem:
     return jax.tree.map(lambda *x: np.stack(x), *problems)
 
 
+DEAR = ("error_bounds", "certify", "certify_rotation")  # up to 30 ms each: drawn less often
 Doors = dict[str, tuple[Callable[..., Any], dict[str, Any]]]
 
 
@@ -287,7 +284,8 @@ def odd_calls(
     came: Counter = Counter()
     for rng in seeds(door, count):
         some = made[rng.integers(len(made))]
-        name = list(some)[rng.integers(len(some))]
+        rare = np.array([0.2 if name in DEAR else 1.0 for name in some])
+        name = str(rng.choice(list(some), p=rare / rare.sum()))
         call, fitting = some[name]
         given, which = dict(fitting), list(fitting)
         for _ in range(rng.choice([0, 1, 1, 1, 1, 2])):
@@ -325,12 +323,12 @@ def _good_files(folder: Path) -> dict[str, bytes]:
     faces = [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]
     ply = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     ply += "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
-    rows = "".join("%g %g %g\n" % tuple(p) for p in corners)
-    listed = "".join("3 %d %d %d\n" % tuple(f) for f in faces)
+    rows = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in corners)
+    listed = "".join(f"3 {i} {j} {k}\n" for i, j, k in faces)
     (good / "model.ply").write_text(ply + rows + listed)
     (good / "model.off").write_text(f"OFF\n4 4 0\n{rows}{listed}")
-    obj = "".join("v %g %g %g\n" % tuple(p) for p in corners)
-    (good / "model.obj").write_text(obj + "".join("f %d %d %d\n" % tuple(k + 1 for k in f) for f in faces))
+    obj = "".join(f"v {x:g} {y:g} {z:g}\n" for x, y, z in corners)
+    (good / "model.obj").write_text(obj + "".join(f"f {i + 1} {j + 1} {k + 1}\n" for i, j, k in faces))
     return {path.name: path.read_bytes() for path in sorted(good.iterdir())}
 
 
@@ -391,7 +389,7 @@ TOKENS = [
 
 
 def argument_lists(door: int, count: int, folder: Path) -> Iterator[list[str]]:
-    """Argument lists that were typed in a hurry; none asks for a picture or a study, which take their time."""
+    """Argument lists typed in a hurry; none asks for a picture or a study, which take their time."""
     _good_files(folder)
     rng = np.random.default_rng(0)
     np.savetxt(folder / "wrong.csv", rng.normal(size=(20, 6)), delimiter=",")

@@ -11,7 +11,8 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import cache
 from typing import Any
 
 import jax
@@ -35,6 +36,7 @@ from fuzzing import (
 import teaser_jax as tj
 from teaser_jax import files, learn, settings
 from teaser_jax.cli import main
+from teaser_jax.cli.arguments import parser
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unchecked")]
 # Of each door; fewer while something is being looked for.
@@ -81,7 +83,7 @@ def test_solve_batch():
         case = draw(rng)
         problem = outcome(lambda case=case: tj.host_problem(case.src, case.dst, **case.known), case.known)
         if problem is not None and rng.random() < 0.3:
-            field = str(rng.choice(list(problem.__dataclass_fields__)))
+            field = str(rng.choice([each.name for each in fields(problem)]))
             problem = replace(problem, **{field: ODD[rng.integers(len(ODD))]})
             case = Case("changed", case.src, case.dst, {field: "odd"})
             if outcome(lambda problem=problem: tj.solve_batch([problem]), problem) is None:
@@ -204,7 +206,7 @@ def test_learn():
 def test_records_and_synthetic():
     """Settings, the records of methods, and problems from seeds."""
     records = {
-        each.__name__: (each, {f: getattr(each(), f) for f in each.__dataclass_fields__})
+        each.__name__: (each, {f.name: getattr(each(), f.name) for f in fields(each)})
         for each in (
             settings.Gnc, settings.ExactClique, settings.ScaleVote, settings.Refinement, settings.PairSearch,
             settings.Relaxation, settings.GreedyClique, tj.Settings,
@@ -236,6 +238,7 @@ def test_files(tmp_path):
 
 def test_command_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("teaser_jax.cli.parser", cache(parser))  # to make it takes as long as to register
     came = Counter()
     for arguments in argument_lists(9, INPUTS, tmp_path):
         out, err = io.StringIO(), io.StringIO()

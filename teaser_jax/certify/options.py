@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax.ground.arrays import is_traced
-from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.checks import shown, whole_number
 
 CertifyMethod = Literal["splitting", "direct", "reference"]
 
@@ -65,5 +65,5 @@ def _between_0_and_1(value: Any) -> float:
     """Read a tolerance between 0 and 1, or raise ValueError."""
     number = np.asarray(value.item() if hasattr(value, "item") and np.shape(value) == () else value)
     if number.shape != () or number.dtype.kind not in "fiu" or not 0 < number < 1:
-        raise ValueError(f"tolerance is {value!r}: expected a number between 0 and 1.")
+        raise ValueError(f"tolerance is {shown(value)}: expected a number between 0 and 1.")
     return float(number)

@@ -78,7 +78,7 @@ def certify_rotation(
     options = checked_options(tolerance, iterations, method, max_measurements)
     mask = np.ones((*stack, k), bool) if mask is None else mask
     known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
-    if is_traced(src, dst, rotation, known, tolerance):
+    if is_traced(src, dst, rotation, *known.values(), tolerance):
         if stack:
             raise ValueError("a stack of problems was given inside jit: use jax.vmap(certify_rotation).")
         return certify_traced(src, dst, rotation, **known, options=options, rounds=options.rounds(k))

@@ -52,10 +52,24 @@ def verify(
         np.all(bound > 0) and np.all(np.isfinite(r)) and np.all(np.isfinite(a)) and np.all(np.isfinite(b))
     ):
         return False
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite costs are cut off, and prove nothing
+        return _holds(a, b, r, bound, certificate, float(c2), float(within))
+
+
+def _holds(
+    a: np.ndarray,
+    b: np.ndarray,
+    r: np.ndarray,
+    bound: np.ndarray,
+    certificate: Any,
+    cbar2: float,
+    within: float,
+) -> bool:
+    """Check a certificate against measurements that fit together."""
     a, b = a / np.broadcast_to(bound, len(a))[:, None], b / np.broadcast_to(bound, len(a))[:, None]
     try:
-        return _follows(a, b, r, certificate, float(c2), float(within)) and is_lower_bound(
-            a, b, float(c2), float(certificate.lower_bound), certificate.rotation, *certificate.dual
+        return _follows(a, b, r, certificate, cbar2, within) and is_lower_bound(
+            a, b, cbar2, float(certificate.lower_bound), certificate.rotation, *certificate.dual
         )
     except (AttributeError, IndexError, TypeError, ValueError):  # not what a certificate looks like
         return False
@@ -63,14 +77,15 @@ def verify(
 
 def _numbers(value: Any) -> np.ndarray:
     """Read numbers in float64; what a masked array hides becomes NaN, of which nothing is proved."""
+    array = np.ma.filled(value.astype(np.float64), np.nan) if np.ma.is_masked(value) else value
     try:
-        if isinstance(value, np.ma.MaskedArray):
-            value = np.ma.filled(value.astype(np.float64), np.nan)
-        return np.asarray(value, np.float64)
+        array = np.asarray(array)
+        if array.dtype.kind in "fiuO":
+            return array.astype(np.float64)
+        reason = f"they are of type {array.dtype}"
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(
-            f"verify received {type(value).__name__} that holds no real numbers ({error})."
-        ) from None
+        reason = str(error)
+    raise ValueError(f"verify received {type(value).__name__} that holds no real numbers: {reason}.")
 
 
 def _follows(a: np.ndarray, b: np.ndarray, r: np.ndarray, c: Any, cbar2: float, tolerance: float) -> bool:

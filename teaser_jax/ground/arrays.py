@@ -50,7 +50,7 @@ def namespace(*arrays: object) -> ModuleType:
 
 def is_traced(*values: Any) -> bool:
     """Tell whether any leaf of the values is a tracer, so that its number is not known."""
-    # Iterators hold no tracers that anyone could find without using them up; JAX warns of them.
+    # Iterators cannot be looked into, and JAX warns of them.
     unclear = [x for x in values if not isinstance(x, CONCRETE) and not isinstance(x, Iterator)]
     return bool(unclear) and any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
 

@@ -10,15 +10,17 @@ import numpy as np
 
 from teaser_jax.ground.arrays import is_traced
 
+LONGEST = 80  # characters of a value that was received
 BELOW = 2**31  # counts are 32-bit numbers on a device
 
 
 def shown(value: Any) -> str:
-    """Write what was received for an error; Python itself refuses integers of thousands of digits."""
+    """Write what was received for an error, in one short line."""
     try:
-        return repr(value)
-    except ValueError:
-        return f"a number of type {type(value).__name__}, far too large"
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python writes no integers of thousands of digits
+        return f"{type(value).__name__} of too many digits"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 def whole_number(

@@ -127,18 +127,17 @@ def check_concrete(record: Any) -> None:
         value, rule = getattr(record, each.name), each.metadata.get(RULE)
         if rule is None or is_traced(value):
             continue
-        if hasattr(value, "dtype") and np.ndim(value) == 0:
-            value = np.asarray(value).item()
         _checked(record, each, value)
 
 
 def _check_name(record: Any) -> None:
     """Raise ValueError if the name that tells a method from every other was given as if it were a choice."""
     for each in fields(record):
-        if each.metadata.get(NAME) and getattr(record, each.name) != each.default:
+        given = getattr(record, each.name)
+        if each.metadata.get(NAME) and not (isinstance(given, str) and given == each.default):
             raise ValueError(
-                f"{type(record).__name__}.name is {getattr(record, each.name)!r}: it is always "
-                f"{each.default!r}; leave it out."
+                f"{type(record).__name__}.{each.name} is {shown(given)}: it is always {each.default!r}, "
+                "so leave it out."
             )
 
 
@@ -164,6 +163,8 @@ def checked_number(name: str, value: Any, rule: NumberRule) -> float:
     Raises:
         ValueError: If it is no number, or breaks the rule.
     """
+    if hasattr(value, "dtype") and np.ndim(value) == 0 and not np.ma.is_masked(value):
+        value = np.asarray(value).item()
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(_as_float(value)):
         raise ValueError(f"{name} is {shown(value)}: expected {rule.words}.")
     return _as_float(value)
