@@ -123,9 +123,11 @@ def as_pose(value: Any) -> Pose:
         return value
     if isinstance(getattr(value, "pose", None), Pose):
         return value.pose
-    if not hasattr(value, "ndim"):
-        value = as_array(value, "the pose matrix")
-    if value.ndim < 2:
+    try:
+        axes = np.ndim(value)
+    except ValueError:  # lists of different lengths
+        axes = 0
+    if axes < 2:
         raise ValueError(
             f"received {type(value).__name__} for a pose: give a Pose, the answer of register, or a matrix "
             "[s R, t; 0, 1] of shape (4, 4)."

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import QUICKLY, certify_on_host, in_float64
-from teaser_jax.certify.host_measurements import HostMeasurements, read_measurements
+from teaser_jax.certify.host_measurements import HostMeasurements, comparable, read_measurements
 from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.relaxation import relaxed_rotation
 from teaser_jax.certify.traced import certify_traced, traced_mask
@@ -82,7 +82,8 @@ def solve_rotation(
 
     Args:
         src, dst: (k, 3) vectors, row k with row k [length]; rows that are not finite are left out.
-        noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length].
+        noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length]. Inside jit,
+            rows too large or too small to be squared and compared are left out.
         method: ``"gnc"``, ``"global"`` or ``"sdp"``, or the record that one of them stands for
             (``teaser_jax.settings.Gnc``, ``PairSearch``, ``Relaxation``). The last needs the extra ``sdp``,
             runs outside jit only and takes up to 100 measurements: 2, 8 and 50 seconds for 20, 30 and 50.
@@ -141,6 +142,7 @@ def _traced(
     src, dst = (jnp.pad(at_least_float32(x), (grown, (0, 0))) for x in (src, dst))
     noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
     src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
+    mask &= comparable(src, dst, noise_bound)
     found = _search(src, dst, noise_bound, cbar2, mask, method)
     if certified:
         certificate = certify_traced(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.ground.arrays import AnyArray, namespace
 from teaser_jax.reading import real_numbers, truth_values
 
 
@@ -54,9 +55,32 @@ def read_measurements(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: An
     bound = np.broadcast_to(noise_bound, (n,))
     if not (np.all((bound[mask] > 0) & (bound[mask] < np.inf)) and np.isfinite(cbar2) and cbar2 > 0):
         raise ValueError("noise_bound and cbar2 must be finite numbers above 0.")
+    finite = mask & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
+    absurd = finite & ~comparable(src, dst, bound)
+    if absurd.any():
+        row = int(np.argmax(absurd))
+        reach = max(np.abs(src[row]).max(), np.abs(dst[row]).max())
+        raise ValueError(
+            f"row {row} reaches {reach:.3g} with a noise_bound of {bound[row]:.3g}, beyond what float64 can "
+            "square and compare: rescale all to a sensible unit."
+        )
     k = int(mask.sum())
     kept = HostMeasurements(src[mask], dst[mask], bound[mask], cbar2, np.ones(k, bool))
     return padded(kept, padded_count(k))
+
+
+def comparable(
+    src: Float[AnyArray, "k 3"], dst: Float[AnyArray, "k 3"], noise_bound: Float[AnyArray, " k"]
+) -> Bool[AnyArray, " k"]:
+    """Tell which vectors can be squared, in units of their bounds, too: iterations on infinity may never end.
+
+    Squares are squared again where matrices of them are multiplied.
+    """
+    xp = namespace(src, dst, noise_bound)
+    most = float(jnp.finfo(src.dtype).max) ** 0.25 / 10
+    reach = xp.maximum(xp.max(xp.abs(src), axis=1), xp.max(xp.abs(dst), axis=1))
+    sizes = (reach < most) & (noise_bound < most) & (noise_bound > 1 / most)
+    return sizes & (reach < most * xp.where(sizes, noise_bound, 1))
 
 
 def padded(measurements: HostMeasurements, size: int) -> HostMeasurements:

@@ -127,7 +127,7 @@ def check_concrete(record: Any) -> None:
         value, rule = getattr(record, each.name), each.metadata.get(RULE)
         if rule is None or is_traced(value):
             continue
-        _checked(record, each, value)
+        _checked(record, each, _as_scalar(value))
 
 
 def _check_name(record: Any) -> None:
@@ -139,6 +139,12 @@ def _check_name(record: Any) -> None:
                 f"{type(record).__name__}.{each.name} is {shown(given)}: it is always {each.default!r}, "
                 "so leave it out."
             )
+
+
+def _as_scalar(value: Any) -> Any:
+    """Take the number out of an array of no axes; whatever else comes is returned."""
+    is_array = hasattr(value, "dtype") and np.ndim(value) == 0 and not np.ma.is_masked(value)
+    return np.asarray(value).item() if is_array else value
 
 
 def _as_float(value: Any) -> float:
@@ -163,8 +169,7 @@ def checked_number(name: str, value: Any, rule: NumberRule) -> float:
     Raises:
         ValueError: If it is no number, or breaks the rule.
     """
-    if hasattr(value, "dtype") and np.ndim(value) == 0 and not np.ma.is_masked(value):
-        value = np.asarray(value).item()
+    value = _as_scalar(value)
     if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(_as_float(value)):
         raise ValueError(f"{name} is {shown(value)}: expected {rule.words}.")
     return _as_float(value)
