@@ -128,6 +128,17 @@ def _check_vectors(src: Any, dst: Any) -> None:
         )
 
 
+def _check_sizes(m: HostMeasurements) -> None:
+    """Raise ValueError for finite rows that are too large or too small to be squared and compared."""
+    finite = m.mask & np.isfinite(m.src).all(axis=1) & np.isfinite(m.dst).all(axis=1)
+    for row in np.flatnonzero(finite & ~comparable(m.src, m.dst, m.noise_bound))[:1]:
+        reach = max(np.abs(m.src[row]).max(), np.abs(m.dst[row]).max())
+        raise ValueError(
+            f"vectors reach {reach:.3g} with a noise_bound of {m.noise_bound[row]:.3g}, beyond what float64 "
+            "can square and compare: rescale all to a sensible unit."
+        )
+
+
 def _traced(
     src: Any, dst: Any, *, noise_bound: Any, cbar2: Any, mask: Any,
     method: RotationMethod, options: Options, certified: bool,
@@ -160,6 +171,7 @@ def _on_host(
     """Find the rotation outside jit, in float64."""
     k = np.shape(src)[0]
     measurements = read_measurements(src, dst, noise_bound, cbar2, mask)
+    _check_sizes(measurements)
     rounds = options.rounds(k)
     # What runs on the host starts from a good rotation of the device's.
     first = PairSearch(gnc=method.gnc) if isinstance(method, Relaxation) else method

@@ -295,7 +295,8 @@ def odd_calls(
         if found is not None:
             look(name, found)
         came[name, found is not None] += 1
-    assert all(came[name, True] and came[name, False] for name in made[0]), came
+    assert all(came[name, True] for name in made[0]), came
+    assert sum(came[name, False] for name in made[0]) > count / 20, came
 
 
 # Files

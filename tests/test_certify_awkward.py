@@ -330,7 +330,7 @@ def test_malformed_certificates_are_refuted_and_never_raise():
 
 @pytest.mark.parametrize("name", ["cbar2", "tolerance", "noise_bound", "rotation"])
 @pytest.mark.parametrize("value", ["x", 1j, [1, [2]], {}])
-def test_what_is_no_number_is_refused_by_verify_and_not_called_unproved(name, value):
+def test_what_is_no_number_is_refused_by_verify_and_not_called_unproved(name, value, unchecked):
     known = dict(rotation=np.eye(3), noise_bound=1.0, cbar2=1.0, tolerance=1e-3) | {name: value}
     with pytest.raises(ValueError, match="no real numbers"):
         verify(np.ones((4, 3)), np.ones((4, 3)), known.pop("rotation"), None, **known)

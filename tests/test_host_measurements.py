@@ -41,8 +41,6 @@ def test_rows_of_the_mask_come_first_and_padding_comes_off():
         (dict(mask=[0, 1, 1, 0, 1]), "pass mask.astype"),
         (dict(noise_bound="a"), "noise_bound has dtype"),
         (dict(src=[[1, 2], [3]]), "src cannot be read"),
-        (dict(noise_bound=1e-160), "square and compare"),
-        (dict(dst=np.full((5, 3), 1e100)), "row 0 reaches 1e.100"),
         (dict(noise_bound=0.0), "above 0"),
         (dict(noise_bound=np.inf), "above 0"),
         (dict(noise_bound=np.nan), "above 0"),

@@ -106,6 +106,7 @@ def test_few_measurements_give_an_answer_and_no_crash(k):
         (dict(cbar2=-1.0), "above 0"),
         (dict(mask=np.ones(3, bool)), "mask has shape"),
         (dict(mask=[0, 2, 5]), "truth values"),
+        (dict(dst=np.full((12, 3), 1e100)), "vectors reach 1e.100 with"),
         (dict(src=np.ones((12, 3), complex)), "expected real numbers"),
         (dict(tolerance="x"), "tolerance is 'x': expected a number between 0 and 1"),
         (dict(tolerance=0.0), "tolerance"),

@@ -214,7 +214,7 @@ def test_other_records_are_told_apart(unchecked):
         tj.solve(drawn.src)
     with pytest.raises(ValueError, match="made with a known scale"):
         tj.refit(replace(problem, scale=None), result.solution.selection)
-    with pytest.raises(ValueError, match="received one Problem"):
+    with pytest.raises(ValueError, match="received Problem"):
         tj.stack_problems(problem)
     with pytest.raises(ValueError, match="problem 1 of the list"):
         tj.stack_problems([problem, replace(problem, dst=problem.dst[:5])])

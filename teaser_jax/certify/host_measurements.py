@@ -55,15 +55,6 @@ def read_measurements(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: An
     bound = np.broadcast_to(noise_bound, (n,))
     if not (np.all((bound[mask] > 0) & (bound[mask] < np.inf)) and np.isfinite(cbar2) and cbar2 > 0):
         raise ValueError("noise_bound and cbar2 must be finite numbers above 0.")
-    finite = mask & np.isfinite(src).all(axis=1) & np.isfinite(dst).all(axis=1)
-    absurd = finite & ~comparable(src, dst, bound)
-    if absurd.any():
-        row = int(np.argmax(absurd))
-        reach = max(np.abs(src[row]).max(), np.abs(dst[row]).max())
-        raise ValueError(
-            f"row {row} reaches {reach:.3g} with a noise_bound of {bound[row]:.3g}, beyond what float64 can "
-            "square and compare: rescale all to a sensible unit."
-        )
     k = int(mask.sum())
     kept = HostMeasurements(src[mask], dst[mask], bound[mask], cbar2, np.ones(k, bool))
     return padded(kept, padded_count(k))
