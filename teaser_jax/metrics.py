@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax import so3
-from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.ground.arrays import AnyArray, as_numpy, namespace
 from teaser_jax.pose import Pose, as_pose
 
 
@@ -83,8 +83,17 @@ def precision_recall(found: Any, right: Any) -> tuple[float, float]:
     Returns:
         The share of those found that are right, and the share of the right ones that are found [-]; NaN where
         there are none to take a share of.
+
+    Raises:
+        ValueError: If one is no mask, or they differ in shape.
     """
-    found, right = np.asarray(found, bool), np.asarray(right, bool)
+    found, right = as_numpy(found, "found"), as_numpy(right, "right")
+    if found.shape != right.shape or not {found.dtype.kind, right.dtype.kind} <= set("biuf"):
+        raise ValueError(
+            f"found has shape {found.shape} and dtype {found.dtype}, right {right.shape} and {right.dtype}: "
+            "expected masks of the same matches."
+        )
+    found, right = found.astype(bool), right.astype(bool)
     both = float(np.sum(found & right))
     share = lambda total: both / total if total else float("nan")
     return float(share(found.sum())), float(share(right.sum()))

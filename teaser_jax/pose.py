@@ -50,9 +50,9 @@ class Pose:
             matrix = matrix.astype(float)
         if not isinstance(matrix, jax.core.Tracer):
             _check_similarity(np.asarray(matrix, np.float64))
-        block = matrix[..., :3, :3]
-        scale = xp.cbrt(xp.linalg.det(block))
-        return cls(block / scale[..., None, None], matrix[..., :3, 3], scale)
+        size, block = _unit_block(matrix, xp)
+        root = xp.cbrt(xp.linalg.det(block))
+        return cls(block / root[..., None, None], matrix[..., :3, 3], size * root)
 
     @property
     def matrix(self) -> Float[AnyArray, "*batch 4 4"]:
@@ -71,6 +71,8 @@ class Pose:
     def apply(self, points: Any) -> Float[AnyArray, "... n 3"]:
         """Carry source points (rows) to the target frame. Raises ValueError unless they are (..., n, 3)."""
         points = as_array(points, "points")
+        if points.dtype.kind in "OSUMmbc" or points.dtype.names:
+            raise ValueError(f"points have dtype {points.dtype}: expected real numbers.")
         if points.dtype.kind in "iu":
             points = points.astype(float)
         if points.ndim < 2 or points.shape[-1] != 3:
@@ -121,7 +123,11 @@ def as_pose(value: Any) -> Pose:
         return value
     if isinstance(getattr(value, "pose", None), Pose):
         return value.pose
-    if np.ndim(value) < 2:
+    try:
+        axes = np.ndim(value)
+    except ValueError:  # lists of different lengths
+        axes = 0
+    if axes < 2:
         raise ValueError(
             f"received {type(value).__name__} for a pose: give a Pose, the answer of register, or a matrix "
             "[s R, t; 0, 1] of shape (4, 4)."
@@ -134,10 +140,18 @@ def as_pose(value: Any) -> Pose:
     return Pose.from_matrix(matrix)
 
 
+def _unit_block(matrix: AnyArray, xp: Any) -> tuple[AnyArray, AnyArray]:
+    """Return the largest entry of s R, and s R in units of it: tiny and huge scales have no cube."""
+    block = matrix[..., :3, :3]
+    largest = xp.max(xp.abs(block), axis=(-2, -1))
+    size = xp.where(largest > 0, largest, xp.ones_like(largest))
+    return size, block / size[..., None, None]
+
+
 def _check_similarity(matrix: np.ndarray) -> None:
     """Raise ValueError unless each matrix is [s R, t; 0, 1] with s above 0, to one in a thousand."""
-    block = matrix[..., :3, :3]
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"):  # entries that are not finite are refused below
+        _, block = _unit_block(matrix, np)
         scale2 = np.cbrt(np.linalg.det(block))[..., None, None] ** 2
         error = np.abs(np.swapaxes(block, -1, -2) @ block - scale2 * np.eye(3))
         proper = np.all(error <= 1e-3 * scale2) and np.all(np.linalg.det(block) > 0)

@@ -199,8 +199,8 @@ def stack_problems(problems: Iterable[Problem]) -> Problem:
     Raises:
         ValueError: If there are none, or scale or pairs are given in some but not in all.
     """
-    if isinstance(problems, Problem):
-        raise ValueError("stack_problems takes a list of problems, and received one Problem.")
+    if isinstance(problems, Problem) or not isinstance(problems, Iterable):
+        raise ValueError(f"stack_problems takes a list of problems, and received {type(problems).__name__}.")
     problems = list(problems)
     if not problems:
         raise ValueError("stack_problems received no problem.")

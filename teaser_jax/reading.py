@@ -130,7 +130,7 @@ def positive_number(value: Any, name: str) -> AnyArray:
 def known_scale(value: Any) -> AnyArray:
     """Read the known scale, one number above 0. Raises ValueError on anything else."""
     array = _read(value, "scale")
-    if array.dtype.kind in "US":
+    if array.dtype.kind in "US" and array.shape == ():
         raise ValueError(f"scale is the text '{array}': give a number, or pass scale=None to estimate it.")
     return positive_number(array, "scale")
 

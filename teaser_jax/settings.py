@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import jax
 import numpy as np
 
-from teaser_jax.ground.checks import one_of
+from teaser_jax.ground.checks import one_of, shown
 from teaser_jax.ground.numbers import as_record, check_concrete
 from teaser_jax.stages.clique.clique import CliqueMethod
 from teaser_jax.stages.clique.every_match import EveryMatch
@@ -93,11 +93,11 @@ def check_record(name: str, record: Any, known: dict[str, Any]) -> None:
     """Check that a choice is one of the known records, and that its numbers are known. Raises ValueError."""
     if not isinstance(record, tuple(known.values())):
         usual = ", ".join(f"{name!r} or {method.__name__}(...)" for name, method in known.items())
-        raise ValueError(f"{name} is {record!r}: expected {usual}.")
+        raise ValueError(f"{name} is {shown(record)}: expected {usual}.")
     check_concrete(record)
     first = getattr(record, "gnc", Gnc())
     if not isinstance(first, Gnc):
-        raise ValueError(f"{type(record).__name__}.gnc is {first!r}: expected a Gnc(...).")
+        raise ValueError(f"{type(record).__name__}.gnc is {shown(first)}: expected a Gnc(...).")
     check_concrete(first)
 
 
@@ -116,7 +116,9 @@ def check_settings(settings: Any) -> None:
 def _check(settings: Any) -> None:
     """Check settings whose numbers may be arrays or tracers."""
     if not isinstance(settings, Settings):
-        raise ValueError(f"settings is {settings!r}: expected Settings, as in Settings(clique='greedy').")
+        raise ValueError(
+            f"settings is {shown(settings)}: expected Settings, as in Settings(clique='greedy')."
+        )
     for name, known in METHODS.items():
         check_record(f"Settings.{name}", getattr(settings, name), known)
     if not isinstance(settings.refine, Refinement | None):

@@ -23,6 +23,7 @@ from teaser_jax.ground.checks import whole_number
 from teaser_jax.ground.loops import until_settled
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, check_precision, clean
+from teaser_jax.reading import positive_number
 from teaser_jax.refit import as_judged, check_problem
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Solution, Status
@@ -110,10 +111,10 @@ def soft_solve(
     check_problem(problem)
     check_precision(problem)
     check_settings(settings)
-    if np.shape(gnc_mu) != () or (
-        not is_traced(gnc_mu) and not (np.isfinite(float(gnc_mu)) and float(gnc_mu) > 0)
-    ):
-        raise ValueError(f"gnc_mu is {gnc_mu}: expected one finite number above 0.")
+    if not is_traced(gnc_mu):
+        gnc_mu = positive_number(gnc_mu, "gnc_mu")
+    elif np.shape(gnc_mu) != ():
+        raise ValueError(f"gnc_mu has shape {np.shape(gnc_mu)}: expected one number.")
     whole_number("iterations", iterations, 1)
     start = solve(lax.stop_gradient(problem), lax.stop_gradient(settings))
     usable, _ = clean(problem)

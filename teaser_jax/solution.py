@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,12 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt32
 
 from teaser_jax.ground.arrays import AnyArray, Placeholder
+from teaser_jax.ground.numbers import NamedNumber
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem
 from teaser_jax.rows import Rows
 
 
-class Status(enum.IntEnum):
+class Status(NamedNumber):
     """What became of a solve. ``OK`` is the only one to act upon. Held as int32 inside JAX."""
 
     OK = 0

@@ -123,7 +123,7 @@ def _read(problem: Any, axes: int, name: str) -> Problem:
         raise ValueError(
             f"{name} is of type {type(problem).__name__}: expected a Problem, as from make_problem."
         )
-    if is_traced(*jax.tree.leaves(problem)):
+    if is_traced(*vars(problem).values()):
         raise ValueError(
             "solve_batch was called inside jit, vmap or grad: use jax.vmap(teaser_jax.solve) there."
         )

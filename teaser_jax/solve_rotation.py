@@ -22,13 +22,14 @@ from jaxtyping import Array, Bool, Float
 from teaser_jax import so3
 from teaser_jax.certify.certificate import Certificate
 from teaser_jax.certify.host import QUICKLY, certify_on_host, in_float64
-from teaser_jax.certify.host_measurements import HostMeasurements, read_measurements
+from teaser_jax.certify.host_measurements import HostMeasurements, comparable, read_measurements
 from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.relaxation import relaxed_rotation
 from teaser_jax.certify.traced import certify_traced, traced_mask
 from teaser_jax.ground.arrays import AnyArray, Placeholder, at_least_float32, is_traced
 from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.numbers import as_record
+from teaser_jax.reading import real_numbers
 from teaser_jax.settings import ROTATIONS, RotationMethod, check_record
 from teaser_jax.stages.rotation.gnc import Gnc, gnc_rotation
 from teaser_jax.stages.rotation.pair_search import PairSearch
@@ -81,7 +82,8 @@ def solve_rotation(
 
     Args:
         src, dst: (k, 3) vectors, row k with row k [length]; rows that are not finite are left out.
-        noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length].
+        noise_bound: delta_k, the bound of the vectors as they are given, one or (k,) [length]. Inside jit,
+            rows too large or too small to be squared and compared are left out.
         method: ``"gnc"``, ``"global"`` or ``"sdp"``, or the record that one of them stands for
             (``teaser_jax.settings.Gnc``, ``PairSearch``, ``Relaxation``). The last needs the extra ``sdp``,
             runs outside jit only and takes up to 100 measurements: 2, 8 and 50 seconds for 20, 30 and 50.
@@ -108,23 +110,33 @@ def solve_rotation(
     chosen: RotationMethod = as_record("method", method, ROTATIONS)
     check_record("method", chosen, ROTATIONS)
     one_of("proof", proof, (*get_args(CertifyMethod), None))
+    src, dst = real_numbers(src, "src"), real_numbers(dst, "dst")
     _check_vectors(src, dst)
     options = checked_options(tolerance, iterations, proof or "splitting", MAX_MEASUREMENTS)
     mask = np.ones(np.shape(src)[0], bool) if mask is None else mask
     known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
-    how = _traced if is_traced(src, dst, known, tolerance) else _on_host
+    how = _traced if is_traced(src, dst, *known.values(), tolerance) else _on_host
     return how(src, dst, **known, method=chosen, options=options, certified=proof is not None)
 
 
 def _check_vectors(src: Any, dst: Any) -> None:
-    """Raise ValueError unless the vectors are (k, 3) both, and real."""
+    """Raise ValueError unless the vectors are (k, 3) both."""
     if np.shape(src) != np.shape(dst) or np.ndim(src) != 2 or np.shape(src)[1] != 3:
         raise ValueError(
             f"src and dst have shapes {np.shape(src)} and {np.shape(dst)}: expected (k, 3) both, rows are "
             "measurements."
         )
-    if any(np.iscomplexobj(x) for x in (src, dst) if not is_traced(x)):
-        raise ValueError("src and dst are real; complex numbers were received.")
+
+
+def _check_sizes(m: HostMeasurements) -> None:
+    """Raise ValueError for finite rows that are too large or too small to be squared and compared."""
+    finite = m.mask & np.isfinite(m.src).all(axis=1) & np.isfinite(m.dst).all(axis=1)
+    for row in np.flatnonzero(finite & ~comparable(m.src, m.dst, m.noise_bound))[:1]:
+        reach = max(np.abs(m.src[row]).max(), np.abs(m.dst[row]).max())
+        raise ValueError(
+            f"vectors reach {reach:.3g} with a noise_bound of {m.noise_bound[row]:.3g}, beyond what float64 "
+            "can square and compare: rescale all to a sensible unit."
+        )
 
 
 def _traced(
@@ -141,6 +153,7 @@ def _traced(
     src, dst = (jnp.pad(at_least_float32(x), (grown, (0, 0))) for x in (src, dst))
     noise_bound = jnp.pad(jnp.broadcast_to(jnp.asarray(noise_bound), (k,)), grown, constant_values=1)
     src, dst, noise_bound, cbar2 = lax.stop_gradient((src, dst, noise_bound, cbar2))
+    mask &= comparable(src, dst, noise_bound)
     found = _search(src, dst, noise_bound, cbar2, mask, method)
     if certified:
         certificate = certify_traced(
@@ -158,6 +171,7 @@ def _on_host(
     """Find the rotation outside jit, in float64."""
     k = np.shape(src)[0]
     measurements = read_measurements(src, dst, noise_bound, cbar2, mask)
+    _check_sizes(measurements)
     rounds = options.rounds(k)
     # What runs on the host starts from a good rotation of the device's.
     first = PairSearch(gnc=method.gnc) if isinstance(method, Relaxation) else method

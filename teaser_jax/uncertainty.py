@@ -18,9 +18,11 @@ from jaxtyping import Array, Bool, Float
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced, safe_norm, safe_sqrt
+from teaser_jax.ground.checks import one_of, shown
 from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose, as_pose
 from teaser_jax.problem import Problem, clean
+from teaser_jax.reading import real_numbers
 from teaser_jax.refit import refit, without_copies
 from teaser_jax.solution import Solution, problem_and_solution
 from teaser_jax.stages.refinement import squared_residuals
@@ -144,15 +146,16 @@ def pose_difference(
 
 
 def _check_convention(convention: Any) -> None:
-    if convention not in get_args(Convention):
-        allowed = ", ".join(repr(x) for x in get_args(Convention))
-        raise ValueError(f"convention is {convention!r}: expected one of {allowed}.")
+    one_of("convention", convention, get_args(Convention))
 
 
 def _checked(sigma: Any, problem: Problem) -> Any:
     n = problem.src.shape[:-1]
     if isinstance(sigma, str):
-        raise ValueError(f"sigma is {sigma!r}: expected a standard deviation; convention=... has its name.")
+        raise ValueError(
+            f"sigma is {shown(sigma)}: expected a standard deviation; convention=... has its name."
+        )
+    sigma = real_numbers(sigma, "sigma")
     if np.shape(sigma) not in ((), n):
         raise ValueError(f"sigma has shape {np.shape(sigma)}: expected one number, or one a match, {n}.")
     if not is_traced(sigma) and not np.all(np.asarray(sigma, float) >= 0):

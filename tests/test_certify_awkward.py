@@ -326,3 +326,15 @@ def test_malformed_certificates_are_refuted_and_never_raise():
     assert not verify(src, dst, np.full((3, 3), np.nan), good, **known)
     with pytest.raises(ValueError, match="do not fit"):
         verify(src, dst[:5], best, good, **known)
+
+
+@pytest.mark.parametrize("name", ["cbar2", "tolerance", "noise_bound", "rotation"])
+@pytest.mark.parametrize("value", ["x", 1j, [1, [2]], {}])
+def test_what_is_no_number_is_refused_by_verify_and_not_called_unproved(name, value, unchecked):
+    known = dict(rotation=np.eye(3), noise_bound=1.0, cbar2=1.0, tolerance=1e-3) | {name: value}
+    with pytest.raises(ValueError, match="no real numbers"):
+        verify(np.ones((4, 3)), np.ones((4, 3)), known.pop("rotation"), None, **known)
+
+
+def test_bounds_far_below_the_vectors_are_verified_without_a_warning():
+    assert not verify(np.ones((4, 3)), np.ones((4, 3)), np.eye(3), None, noise_bound=1e-300)

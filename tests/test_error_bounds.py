@@ -173,5 +173,8 @@ def test_bad_input_is_refused():
     _, result = registered(0, 40, 0.25)
     with pytest.raises(ValueError, match="wrong is -1"):
         tj.error_bounds(result.problem, result.solution, wrong=-1)
+    told = repr(tj.error_bounds(result.problem, result.solution, wrong=39))
+    assert "of the whole set nothing follows" in told
+    assert "nan" not in told
     with pytest.raises(ValueError, match="outside jit"):
         jax.jit(lambda p: tj.error_bounds(p, result.solution).scale)(result.problem)

@@ -36,7 +36,11 @@ def test_rows_of_the_mask_come_first_and_padding_comes_off():
     [
         (dict(noise_bound=np.ones(3)), "shapes"),
         (dict(cbar2=np.ones(2)), "shapes"),
-        (dict(mask=np.ones(3, bool)), "shapes"),
+        (dict(mask=np.ones(3, bool)), "mask has shape"),
+        (dict(mask=[0, 2, 3]), "expected .* truth values"),
+        (dict(mask=[0, 1, 1, 0, 1]), "pass mask.astype"),
+        (dict(noise_bound="a"), "noise_bound has dtype"),
+        (dict(src=[[1, 2], [3]]), "src cannot be read"),
         (dict(noise_bound=0.0), "above 0"),
         (dict(noise_bound=np.inf), "above 0"),
         (dict(noise_bound=np.nan), "above 0"),
@@ -53,3 +57,9 @@ def test_a_bound_outside_the_mask_may_be_anything():
     bounds = np.array([1.0, np.nan, 1.0])
     read = read_measurements(np.ones((3, 3)), np.ones((3, 3)), bounds, 1.0, np.array([True, False, True]))
     assert read.measured == 2
+
+
+def test_what_a_masked_array_hides_is_no_measurement():
+    src = np.ma.masked_array(np.ones((5, 3)), np.arange(5)[:, None] == [[1, 1, 1]])
+    read = read_measurements(src, np.ones((5, 3)), 1.0, 1.0, np.ones(5, bool))
+    assert np.isnan(read.src[1]).all()

@@ -61,3 +61,9 @@ def test_errors_are_the_three_at_once():
     found = metrics.errors(estimate, truth)
     assert found == pytest.approx((0.1, 5.0, 0.5))
     assert found.rotation_deg == pytest.approx(math.degrees(0.1))
+
+
+def test_what_is_no_mask_of_the_same_matches(unchecked):
+    for found in (np.ones(3, bool), ["a", "b"], np.zeros(2, [("x", float)])):
+        with pytest.raises(ValueError, match="expected masks of the same matches"):
+            tj.metrics.precision_recall(found, np.ones(2, bool))

@@ -48,8 +48,17 @@ def test_numpy_reads_the_matrix(two):
 def test_points_may_be_a_list_or_whole_numbers(two):
     for points in ([[1, 2, 3]], [[1.0, 2.0, 3.0]], np.array([[1, 2, 3]])):
         np.testing.assert_allclose(two[0].apply(points), two[0].apply(np.array([[1.0, 2, 3]])))
-    with pytest.raises(ValueError, match="points cannot be read|points have shape"):
-        two[0].apply("x")
+    for points in ("x", [["a", "b", "c"]], [[1j, 0, 0]], np.zeros((2, 3), object)):
+        with pytest.raises(ValueError, match="points (cannot be read|have)"):
+            two[0].apply(points)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e150, 1e300])
+def test_a_scale_of_any_size_comes_back_from_its_matrix(two, scale):
+    pose = Pose(two[0].rotation, two[0].translation, np.asarray(scale))
+    found = Pose.from_matrix(pose.matrix)
+    np.testing.assert_allclose(found.scale, scale)
+    np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -58,6 +67,7 @@ def test_points_may_be_a_list_or_whole_numbers(two):
         ("x", "received str for a pose"), (None, "received NoneType for a pose"),
         (np.eye(3), r"received \(3, 3\)"), (np.diag([1.0, 1, -1, 1]), "mirrored"),
         (np.eye(4, dtype=complex), "real numbers"), (np.ones((2, 2)), "shape"),
+        ([1, [2, 3]], "received list"),
     ],
     ids=str,
 )  # fmt: skip

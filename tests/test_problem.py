@@ -334,10 +334,12 @@ def test_stacking_takes_any_iterable():
         ([], "no problem"),
         ([make(), make(scale=None)], "some problems have scale=None"),
         ([make(), make(pairs=[[0, 1]])], "some problems have pairs=None"),
+        (5, "takes a list of problems, and received int"),
+        (make(), "takes a list of problems, and received Problem"),
     ],
-    ids=["none", "scale", "pairs"],
+    ids=["none", "scale", "pairs", "number", "problem"],
 )
-def test_stacking_refuses_a_mixture(problems, message):
+def test_stacking_refuses_a_mixture_and_what_is_no_list(problems, message, unchecked):
     with pytest.raises(ValueError, match=message):
         tj.stack_problems(problems)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -103,7 +104,11 @@ def test_few_measurements_give_an_answer_and_no_crash(k):
         (dict(noise_bound=0.0), "above 0"),
         (dict(noise_bound=np.ones(3)), "shapes"),
         (dict(cbar2=-1.0), "above 0"),
-        (dict(mask=np.ones(3, bool)), "shapes"),
+        (dict(mask=np.ones(3, bool)), "mask has shape"),
+        (dict(mask=[0, 2, 5]), "truth values"),
+        (dict(dst=np.full((12, 3), 1e100)), "vectors reach 1e.100 with"),
+        (dict(src=np.ones((12, 3), complex)), "expected real numbers"),
+        (dict(tolerance="x"), "tolerance is 'x': expected a number between 0 and 1"),
         (dict(tolerance=0.0), "tolerance"),
         (dict(proof="magic"), "proof is 'magic'"),
     ],
@@ -122,3 +127,13 @@ def test_the_record_is_asked_for_its_turn(monkeypatch):
     a = np.random.default_rng(0).normal(size=(9, 3))
     tj.solve_rotation(a, a, noise_bound=0.1, method=PairSearch(gnc=Gnc(iterations=7)), proof=None)
     assert asked
+
+
+def test_vectors_far_beyond_their_bounds_end_no_iteration_and_have_no_rotation():
+    src, dst, _ = draw_vectors(0, 12, 0.0)
+    with pytest.raises(ValueError, match="square and compare"):
+        tj.solve_rotation(src, dst, noise_bound=1e-160)
+    ask = lambda bound: tj.solve_rotation(src, dst, noise_bound=bound, method="gnc", proof=None)
+    found = jax.jit(ask)(jnp.float32(1e-19))
+    assert_allclose(found.rotation, np.eye(3))
+    assert not found.inliers.any()

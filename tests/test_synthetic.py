@@ -138,14 +138,27 @@ def test_all_to_all_matches_every_point_with_every_point():
 @pytest.mark.parametrize(
     ("make", "known", "message"),
     [
-        (synthetic.random_problem, dict(n=0), "n above 0"),
-        (synthetic.random_problem, dict(sigma=-1.0), "sigma 0 or above"),
+        (synthetic.random_problem, dict(n=0), "n is 0: expected a whole number"),
+        (synthetic.random_problem, dict(sigma=-1.0), "sigma is -1.0: expected 0 or more"),
         (synthetic.random_problem, dict(outlier_rate=1.5), "outlier_rate is 1.5"),
         (synthetic.random_problem, dict(sigma=1.0, noise_bound=0.1), "below sigma"),
         (synthetic.descriptor_problem, dict(n=10, sigma=5.0), "spans the target"),
         (synthetic.all_to_all, dict(overlap=0.0), "overlap is 0.0"),
+        (synthetic.random_problem, dict(scale=-1), "scale is -1: expected a number above 0"),
+        (synthetic.random_problem, dict(scale=0), "scale is 0: expected a number above 0"),
+        (synthetic.random_problem, dict(scale=None), "scale is None: expected a number above 0"),
+        (synthetic.random_problem, dict(scale=(2, 1)), r"scale is \(2, 1\): expected one number, or a range"),
+        (synthetic.random_problem, dict(sigma="a"), "sigma is 'a': expected 0 or more"),
+        (synthetic.random_problem, dict(noise_bound=10**400), "noise_bound is 10*...: expected"),
+        (synthetic.random_problem, dict(n=2.5), "n is 2.5: expected a whole number"),
     ],
 )
-def test_what_makes_no_sense_is_refused(make, known, message):
+def test_what_makes_no_sense_is_refused(make, known, message, unchecked):
     with pytest.raises(ValueError, match=message):
         make(0, **known)
+
+
+@pytest.mark.parametrize("seed", [-1, "a", 0.5, [1, -2]])
+def test_what_is_no_seed(seed, unchecked):
+    with pytest.raises(ValueError, match="expected a whole number, 0 or above"):
+        synthetic.random_problem(seed)

@@ -139,7 +139,13 @@ def test_no_noise_is_exact(x64):
 def test_bad_arguments_are_told_apart(unchecked):
     matches = random_matches(8, N)
     result = tj.register(matches.src, matches.dst, noise_bound=0.05)
-    for sigma, words in ((-1.0, "below 0"), (np.nan, "below 0"), (np.ones(3), "shape")):
+    for sigma, words in (
+        (-1.0, "below 0"),
+        (np.nan, "below 0"),
+        (np.ones(3), "shape"),
+        ({}, "sigma"),
+        (10**400, "sigma"),
+    ):
         with pytest.raises(ValueError, match=words):
             tj.covariance(result.problem, result.solution, sigma)
     with pytest.raises(ValueError, match="expected one of 'right', 'ros'"):
@@ -208,7 +214,7 @@ def test_other_records_are_told_apart(unchecked):
         tj.solve(drawn.src)
     with pytest.raises(ValueError, match="made with a known scale"):
         tj.refit(replace(problem, scale=None), result.solution.selection)
-    with pytest.raises(ValueError, match="received one Problem"):
+    with pytest.raises(ValueError, match="received Problem"):
         tj.stack_problems(problem)
     with pytest.raises(ValueError, match="problem 1 of the list"):
         tj.stack_problems([problem, replace(problem, dst=problem.dst[:5])])

@@ -32,7 +32,7 @@ class Bound(NamedTuple):
     @property
     def words(self) -> str:
         """The number of the bound, and where it says nothing the reason."""
-        number = f"{self.value:.3g}"
+        number = "unknown" if np.isnan(self.value) else f"{self.value:.3g}"
         return number if self.informative else f"{number} ({self.reason or 'says nothing'})"
 
 

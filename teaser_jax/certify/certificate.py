@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from dataclasses import dataclass
 
 import jax
@@ -11,9 +10,10 @@ from jaxtyping import Bool, Float, Int
 
 from teaser_jax.certify.dual import Dual
 from teaser_jax.ground.arrays import AnyArray, Placeholder
+from teaser_jax.ground.numbers import NamedNumber
 
 
-class CertificateStatus(enum.IntEnum):
+class CertificateStatus(NamedNumber):
     """What a certificate came to. Held as int32 inside JAX."""
 
     OPTIMAL = 0
@@ -49,7 +49,7 @@ _ADVICE = {
 }
 
 
-class CertifiedBy(enum.IntEnum):
+class CertifiedBy(NamedNumber):
     """How the lower bound of a certificate was found. Held as int32 inside JAX."""
 
     NOTHING = 0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.ground.arrays import AnyArray, namespace
+from teaser_jax.reading import real_numbers, truth_values
 
 
 class HostMeasurements(NamedTuple):
@@ -36,15 +38,19 @@ def read_measurements(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: An
     """Read measurements on the host, drop the rows outside the mask, and pad the others.
 
     Raises:
-        ValueError: Shapes that do not fit, or bounds that are not finite numbers above 0.
+        ValueError: Shapes that do not fit, a mask that holds no truth values, or bounds that are not finite
+            numbers above 0.
     """
-    src, dst, noise_bound, cbar2 = (np.asarray(x, np.float64) for x in (src, dst, noise_bound, cbar2))
-    mask = np.asarray(mask, bool)
+    given = {"src": src, "dst": dst, "noise_bound": noise_bound, "cbar2": cbar2}
+    src, dst, noise_bound, cbar2 = (
+        np.asarray(real_numbers(value, name), np.float64) for name, value in given.items()
+    )
     n = len(src)
-    if mask.shape != (n,) or noise_bound.shape not in ((), (n,)) or cbar2.shape != ():
+    mask = truth_values(mask, n)
+    if noise_bound.shape not in ((), (n,)) or cbar2.shape != ():
         raise ValueError(
-            f"noise_bound, cbar2 and mask have shapes {noise_bound.shape}, {cbar2.shape} and {mask.shape}: "
-            f"expected () or ({n},), () and ({n},)."
+            f"noise_bound and cbar2 have shapes {noise_bound.shape} and {cbar2.shape}: expected () or "
+            f"({n},), and ()."
         )
     bound = np.broadcast_to(noise_bound, (n,))
     if not (np.all((bound[mask] > 0) & (bound[mask] < np.inf)) and np.isfinite(cbar2) and cbar2 > 0):
@@ -52,6 +58,20 @@ def read_measurements(src: Any, dst: Any, noise_bound: Any, cbar2: Any, mask: An
     k = int(mask.sum())
     kept = HostMeasurements(src[mask], dst[mask], bound[mask], cbar2, np.ones(k, bool))
     return padded(kept, padded_count(k))
+
+
+def comparable(
+    src: Float[AnyArray, "k 3"], dst: Float[AnyArray, "k 3"], noise_bound: Float[AnyArray, " k"]
+) -> Bool[AnyArray, " k"]:
+    """Tell which vectors can be squared, in units of their bounds, too: iterations on infinity may never end.
+
+    Squares are squared again where matrices of them are multiplied.
+    """
+    xp = namespace(src, dst, noise_bound)
+    most = float(jnp.finfo(src.dtype).max) ** 0.25 / 10
+    reach = xp.maximum(xp.max(xp.abs(src), axis=1), xp.max(xp.abs(dst), axis=1))
+    sizes = (reach < most) & (noise_bound < most) & (noise_bound > 1 / most)
+    return sizes & (reach < most * xp.where(sizes, noise_bound, 1))
 
 
 def padded(measurements: HostMeasurements, size: int) -> HostMeasurements:

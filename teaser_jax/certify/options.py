@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from numbers import Real
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax.ground.arrays import is_traced
-from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.checks import shown, whole_number
 
 CertifyMethod = Literal["splitting", "direct", "reference"]
 
@@ -64,6 +63,7 @@ def default_iterations(k: int) -> int:
 
 def _between_0_and_1(value: Any) -> float:
     """Read a tolerance between 0 and 1, or raise ValueError."""
-    if not isinstance(value, Real) and np.shape(value) != () or not 0 < value < 1:
-        raise ValueError(f"tolerance is {value!r}: expected a number between 0 and 1.")
-    return float(value)
+    number = np.asarray(value.item() if hasattr(value, "item") and np.shape(value) == () else value)
+    if number.shape != () or number.dtype.kind not in "fiu" or not 0 < number < 1:
+        raise ValueError(f"tolerance is {shown(value)}: expected a number between 0 and 1.")
+    return float(number)

@@ -16,8 +16,9 @@ from teaser_jax.certify.host_measurements import read_measurements
 from teaser_jax.certify.options import MAX_MEASUREMENTS, TOLERANCE, CertifyMethod, Options, checked_options
 from teaser_jax.certify.stack import certify_stack
 from teaser_jax.certify.traced import certify_traced
-from teaser_jax.ground.arrays import is_traced
+from teaser_jax.ground.arrays import as_numpy, is_traced
 from teaser_jax.ground.checks import one_of
+from teaser_jax.reading import real_numbers
 
 
 # Longer than other functions: the docstring of a public door says all about its arguments.
@@ -70,11 +71,14 @@ def certify_rotation(
     References: Yang, Shi, Carlone, T-RO 2021, section VIII-C, problems (19) and (23), Algorithm 3.
     """
     one_of("method", method, get_args(CertifyMethod))
+    src, dst, rotation = (
+        real_numbers(x, name) for x, name in ((src, "src"), (dst, "dst"), (rotation, "rotation"))
+    )
     *stack, k, _ = _checked_shape(src, dst, rotation)
     options = checked_options(tolerance, iterations, method, max_measurements)
     mask = np.ones((*stack, k), bool) if mask is None else mask
     known = dict(noise_bound=noise_bound, cbar2=cbar2, mask=mask)
-    if is_traced(src, dst, rotation, known, tolerance):
+    if is_traced(src, dst, rotation, *known.values(), tolerance):
         if stack:
             raise ValueError("a stack of problems was given inside jit: use jax.vmap(certify_rotation).")
         return certify_traced(src, dst, rotation, **known, options=options, rounds=options.rounds(k))
@@ -89,7 +93,10 @@ def _stack_on_host(
 ) -> Certificate:
     """Certify a stack of rotations, (b, 3, 3) or one for all, each against its own measurements."""
     b, k = np.shape(src)[:2]
-    mask = np.asarray(mask, bool)
+    noise_bound, cbar2 = real_numbers(noise_bound, "noise_bound"), real_numbers(cbar2, "cbar2")
+    mask = as_numpy(mask, "mask")
+    if mask.dtype.kind != "b":
+        raise ValueError(f"mask has dtype {mask.dtype}: expected truth values.")
     stacked = {"noise_bound": (noise_bound, (b, k)), "cbar2": (cbar2, (b,)), "mask": (mask, (b, k))}
     for name, (value, expected) in stacked.items():
         if np.shape(value) not in ((), expected):
@@ -107,8 +114,6 @@ def _stack_on_host(
 def _checked_shape(src: Any, dst: Any, rotation: Any) -> tuple[int, ...]:
     """Return the shape of the vectors, (k, 3) or (b, k, 3); ValueError if the others do not fit it."""
     a, b, r = np.shape(src), np.shape(dst), np.shape(rotation)
-    if any(np.iscomplexobj(x) for x in (src, dst, rotation) if not is_traced(x)):
-        raise ValueError("src, dst and rotation are real; complex numbers were received.")
     if not (a == b and len(a) in (2, 3) and a[-1] == 3 and r in ((3, 3), (*a[:-2], 3, 3))):
         raise ValueError(
             f"src, dst and rotation have shapes {a}, {b} and {r}: expected (k, 3), (k, 3) and (3, 3), rows "

@@ -41,23 +41,51 @@ def verify(
         nothing: not that the rotation is bad.
 
     Raises:
-        ValueError: If measurements or rotation have shapes that do not fit.
+        ValueError: If measurements or rotation have shapes that do not fit, or an argument is no number.
     """
-    a, b, r, bound = (np.asarray(x, np.float64) for x in (src, dst, rotation, noise_bound))
+    a, b, r, bound, c2, within = (_numbers(x) for x in (src, dst, rotation, noise_bound, cbar2, tolerance))
     fits = a.shape == b.shape and a.shape[1:] == (3,) and r.shape == (3, 3) and bound.shape in ((), (len(a),))
-    if not fits:
-        raise ValueError(f"shapes {a.shape}, {b.shape}, {r.shape}, {bound.shape} do not fit.")
+    if not (fits and c2.shape == within.shape == ()):
+        shapes = ", ".join(str(x.shape) for x in (a, b, r, bound, c2, within))
+        raise ValueError(f"src, dst, rotation, noise_bound, cbar2 and tolerance do not fit: shapes {shapes}.")
     if not (
         np.all(bound > 0) and np.all(np.isfinite(r)) and np.all(np.isfinite(a)) and np.all(np.isfinite(b))
     ):
         return False
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite costs are cut off, and prove nothing
+        return _holds(a, b, r, bound, certificate, float(c2), float(within))
+
+
+def _holds(
+    a: np.ndarray,
+    b: np.ndarray,
+    r: np.ndarray,
+    bound: np.ndarray,
+    certificate: Any,
+    cbar2: float,
+    within: float,
+) -> bool:
+    """Check a certificate against measurements that fit together."""
     a, b = a / np.broadcast_to(bound, len(a))[:, None], b / np.broadcast_to(bound, len(a))[:, None]
     try:
-        return _follows(a, b, r, certificate, float(cbar2), tolerance) and is_lower_bound(
-            a, b, float(cbar2), float(certificate.lower_bound), certificate.rotation, *certificate.dual
+        return _follows(a, b, r, certificate, cbar2, within) and is_lower_bound(
+            a, b, cbar2, float(certificate.lower_bound), certificate.rotation, *certificate.dual
         )
     except (AttributeError, IndexError, TypeError, ValueError):  # not what a certificate looks like
         return False
+
+
+def _numbers(value: Any) -> np.ndarray:
+    """Read numbers in float64; what a masked array hides becomes NaN, of which nothing is proved."""
+    array = np.ma.filled(value.astype(np.float64), np.nan) if np.ma.is_masked(value) else value
+    try:
+        array = np.asarray(array)
+        if array.dtype.kind in "fiuO":
+            return array.astype(np.float64)
+        reason = f"they are of type {array.dtype}"
+    except (TypeError, ValueError, OverflowError) as error:
+        reason = str(error)
+    raise ValueError(f"verify received {type(value).__name__} that holds no real numbers: {reason}.")
 
 
 def _follows(a: np.ndarray, b: np.ndarray, r: np.ndarray, c: Any, cbar2: float, tolerance: float) -> bool:

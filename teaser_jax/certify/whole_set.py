@@ -44,6 +44,8 @@ class WholeSet:
     @property
     def words(self) -> str:
         """The assumption, and the bounds that follow from it."""
+        if np.isnan(self.angle.value):
+            return f"of the whole set nothing follows: {self.angle.reason}"
         degrees = self.angle._replace(value=np.degrees(self.angle.value))
         assumed = f"all but {self.wrong}" if self.wrong else "all"
         return (

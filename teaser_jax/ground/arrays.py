@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -49,7 +50,8 @@ def namespace(*arrays: object) -> ModuleType:
 
 def is_traced(*values: Any) -> bool:
     """Tell whether any leaf of the values is a tracer, so that its number is not known."""
-    unclear = [x for x in values if not isinstance(x, CONCRETE)]
+    # Iterators cannot be looked into, and JAX warns of them.
+    unclear = [x for x in values if not isinstance(x, CONCRETE) and not isinstance(x, Iterator)]
     return bool(unclear) and any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(unclear))
 
 

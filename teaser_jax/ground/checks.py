@@ -10,7 +10,17 @@ import numpy as np
 
 from teaser_jax.ground.arrays import is_traced
 
+LONGEST = 80  # characters of a value that was received
 BELOW = 2**31  # counts are 32-bit numbers on a device
+
+
+def shown(value: Any) -> str:
+    """Write what was received for an error, in one short line."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python writes no integers of thousands of digits
+        return f"{type(value).__name__} of too many digits"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 def whole_number(
@@ -37,9 +47,9 @@ def whole_number(
     """
     words = f"a whole number, {what}" if what else "a whole number"
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise error(f"{name} is {value!r}: expected {words}, {least} or above.")
+        raise error(f"{name} is {shown(value)}: expected {words}, {least} or above.")
     if below is not None and int(value) >= below:
-        raise error(f"{name} is {value!r}: expected {words} below {below}.")
+        raise error(f"{name} is {shown(value)}: expected {words} below {below}.")
     return int(value)
 
 
@@ -54,7 +64,7 @@ def one_of(name: str, value: Any, allowed: Iterable[Any], *, expected: str = "on
     """
     listed = list(allowed)
     if not any(value is known or (isinstance(value, str) and value == known) for known in listed):
-        raise ValueError(f"{name} is {value!r}: expected {expected} {', '.join(map(repr, listed))}.")
+        raise ValueError(f"{name} is {shown(value)}: expected {expected} {', '.join(map(repr, listed))}.")
 
 
 def check_positive(**numbers: Any) -> None:
@@ -66,6 +76,9 @@ def check_positive(**numbers: Any) -> None:
     for name, value in numbers.items():
         if is_traced(value):
             continue
-        given = np.asarray(value, float)
+        try:
+            given = np.asarray(value, float)
+        except (TypeError, ValueError, OverflowError):  # texts, lists of any length, integers without end
+            given = np.asarray(np.nan)
         if not (np.isfinite(given).all() and (given > 0).all()):
-            raise ValueError(f"{name} is {value}: expected a finite number above 0.")
+            raise ValueError(f"{name} is {shown(value)}: expected a finite number above 0.")

@@ -62,8 +62,10 @@ def read_archive(path: Path, wanted: Collection[str] | None = None) -> Archive:
     return or_file_error(path, "is no .npz archive, or is broken", lambda: _arrays(path, wanted))
 
 
-def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
+def or_file_error(path: Path, what: str, read: Callable[[], Any], *, quoting: bool = True) -> Any:
     """Return what ``read`` returns; whatever it raises, but OSError, becomes a FileError that says ``what``.
+
+    With ``quoting`` the words of whoever raised it follow in brackets.
 
     Broken files make zipfile, zlib, struct, ast and numpy raise nearly anything, in every
     version something else: so everything is caught here, and nowhere else.
@@ -74,7 +76,7 @@ def or_file_error(path: Path, what: str, read: Callable[[], Any]) -> Any:
         raise
     except Exception as error:
         reason = one_line(error) or type(error).__name__
-        raise FileError(f"{path}: {what} ({reason}).") from error
+        raise FileError(f"{path}: {what} ({reason})." if quoting else f"{path}: {what}.") from error
 
 
 @contextmanager

@@ -8,6 +8,7 @@ time, also from placeholders that are no numbers; only what is a number is check
 
 from __future__ import annotations
 
+import enum
 from dataclasses import Field, dataclass, field, fields
 from numbers import Real
 from typing import Any, TypeAlias
@@ -16,12 +17,22 @@ import numpy as np
 from jaxtyping import Num
 
 from teaser_jax.ground.arrays import AnyArray, Placeholder, is_traced
-from teaser_jax.ground.checks import one_of, whole_number
+from teaser_jax.ground.checks import one_of, shown, whole_number
 
 # What a traced field holds: a number that is known, or an array of one; with the axes of a batch, of many.
 TracedNumber: TypeAlias = float | Num[AnyArray, "..."] | Placeholder
 
-RULE = "rule"
+RULE, NAME = "rule", "name"
+
+
+class NamedNumber(enum.IntEnum):
+    """Numbers with names: a number inside JAX, and printed by its name."""
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __format__(self, spec: str) -> str:
+        return format(int(self), spec) if spec.endswith("d") else format(self.name, spec)
 
 
 @dataclass(frozen=True)
@@ -77,7 +88,7 @@ def named(name: str) -> Any:
     JAX takes two records for one structure if their fields are alike, whatever their classes are: without a
     name, a program compiled for one method would be run for another.
     """
-    return field(default=name, repr=False, kw_only=True, metadata={"static": True})
+    return field(default=name, repr=False, kw_only=True, metadata={"static": True, NAME: True})
 
 
 def settle(record: Any) -> None:
@@ -86,6 +97,7 @@ def settle(record: Any) -> None:
     Raises:
         ValueError: If one breaks its rule, or is a text or a truth value.
     """
+    _check_name(record)
     for each in fields(record):
         value, rule = getattr(record, each.name), each.metadata.get(RULE)
         if rule is not None and isinstance(value, str | Real | np.bool_):
@@ -110,13 +122,37 @@ def check_concrete(record: Any) -> None:
     Raises:
         ValueError: If one is missing, no number at all, or out of range.
     """
+    _check_name(record)
     for each in fields(record):
         value, rule = getattr(record, each.name), each.metadata.get(RULE)
         if rule is None or is_traced(value):
             continue
-        if hasattr(value, "dtype") and np.ndim(value) == 0:
-            value = np.asarray(value).item()
-        _checked(record, each, value)
+        _checked(record, each, _as_scalar(value))
+
+
+def _check_name(record: Any) -> None:
+    """Raise ValueError if the name that tells a method from every other was given as if it were a choice."""
+    for each in fields(record):
+        given = getattr(record, each.name)
+        if each.metadata.get(NAME) and not (isinstance(given, str) and given == each.default):
+            raise ValueError(
+                f"{type(record).__name__}.{each.name} is {shown(given)}: it is always {each.default!r}, "
+                "so leave it out."
+            )
+
+
+def _as_scalar(value: Any) -> Any:
+    """Take the number out of an array of no axes; whatever else comes is returned."""
+    is_array = hasattr(value, "dtype") and np.ndim(value) == 0 and not np.ma.is_masked(value)
+    return np.asarray(value).item() if is_array else value
+
+
+def _as_float(value: Any) -> float:
+    """Convert a number; an integer beyond all floats becomes infinite."""
+    try:
+        return float(value)
+    except OverflowError:
+        return np.inf if value > 0 else -np.inf
 
 
 def _checked(record: Any, which: Field[Any], value: Any) -> float | int:
@@ -124,6 +160,16 @@ def _checked(record: Any, which: Field[Any], value: Any) -> float | int:
     name, rule = f"{type(record).__name__}.{which.name}", which.metadata[RULE]
     if isinstance(rule, CountRule):
         return whole_number(name, value, rule.least)
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(float(value)):
-        raise ValueError(f"{name} is {value!r}: expected {rule.words}.")
-    return float(value)
+    return checked_number(name, value, rule)
+
+
+def checked_number(name: str, value: Any, rule: NumberRule) -> float:
+    """Check a number by a rule, and make a Python float of it.
+
+    Raises:
+        ValueError: If it is no number, or breaks the rule.
+    """
+    value = _as_scalar(value)
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(_as_float(value)):
+        raise ValueError(f"{name} is {shown(value)}: expected {rule.words}.")
+    return _as_float(value)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import Placeholder, is_traced, safe_norm, safe_sqrt
+from teaser_jax.ground.checks import shown
 from teaser_jax.ground.numbers import TracedNumber, named
 from teaser_jax.stages.pairs import (
     PairSlice,
@@ -45,7 +46,7 @@ class ScaleVote:
 
     def __post_init__(self) -> None:
         if not isinstance(self.range, tuple) or len(self.range) != 2:
-            raise ValueError(f"ScaleVote.range is {self.range!r}: expected (low, high).")
+            raise ValueError(f"ScaleVote.range is {shown(self.range)}: expected (low, high).")
         # JAX rebuilds records from placeholders, too: only what is a number is looked at.
         limits = tuple(float(x) if isinstance(x, Real) else x for x in self.range)
         if any(isinstance(x, str) for x in limits) or all(isinstance(x, float) for x in limits):
@@ -61,9 +62,11 @@ class ScaleVote:
         try:
             low, high = (float(x) for x in limits)
         except (TypeError, ValueError):
-            raise ValueError(f"ScaleVote.range is {self.range!r}: expected two numbers.") from None
+            raise ValueError(f"ScaleVote.range is {shown(self.range)}: expected two numbers.") from None
         if not 0 <= low < high:
-            raise ValueError(f"ScaleVote.range is {self.range!r}: expected (low, high) with 0 <= low < high.")
+            raise ValueError(
+                f"ScaleVote.range is {shown(self.range)}: expected (low, high) with 0 <= low < high."
+            )
 
 
 def estimate_scale(

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Real
 
 from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.checks import shown
 
 Points: TypeAlias = Float[np.ndarray, "n 3"]
 Seed: TypeAlias = int | np.integer | Sequence[int] | np.random.SeedSequence
@@ -31,6 +32,16 @@ class Triangles(NamedTuple):
 
 
 Shape: TypeAlias = Real[np.ndarray, "m 3"] | Triangles | None  # what points are drawn from; None: the teapot
+
+
+def generator(seed: Any) -> np.random.Generator:
+    """Make a generator from a seed, or pass one on. Raises ValueError for what is no seed."""
+    try:
+        return np.random.default_rng(seed)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"seed is {shown(seed)}: expected a whole number, 0 or above, or several of them."
+        ) from None
 
 
 def sample_model(rng: np.random.Generator, n: int, model: Shape = None) -> Points:

@@ -7,14 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax import so3
 from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.checks import shown, whole_number
+from teaser_jax.ground.numbers import NumberRule, checked_number
 from teaser_jax.pose import Pose
-from teaser_jax.synthetic.models import Points, Seed, Shape, sample_model
+from teaser_jax.synthetic.models import Points, Seed, Shape, generator, sample_model
 
 SIGMA = 0.01
 BOUND_PER_SIGMA = 5.54  # exceeded by one in 10^6 Gaussian errors of three dimensions
@@ -73,7 +76,8 @@ def random_problem(
 
     References: section XI-A.
     """
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
+    checked_number("radius", radius, NumberRule(above=0))
     right = _right_matches(rng, n, scale, sigma, noise_bound, model, truth)
     return _with_outliers(rng, right, outlier_rate, lambda rows: in_ball(rng, len(rows), radius))
 
@@ -103,7 +107,8 @@ def descriptor_problem(
     Raises:
         ValueError: As ``random_problem``; and if the bound spans the target, so that no match could be wrong.
     """
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
+    checked_number("hubs", hubs, NumberRule(above=0))
     right = _right_matches(rng, n, scale, sigma, noise_bound, model, truth)
     attractive = right.dst[rng.permutation(n)[: max(2, round(hubs * n))]]
     return _with_outliers(
@@ -138,9 +143,9 @@ def all_to_all(
 
     References: section XI-C, Fig. 7.
     """
-    if not 0 < overlap <= 1:
+    if checked_number("overlap", overlap, NumberRule(above=0)) > 1:
         raise ValueError(f"overlap is {overlap}: expected a share above 0, at most 1.")
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     whole = _right_matches(rng, n, 1.0, sigma, noise_bound, model, truth)
     kept = rng.permutation(n)[: max(1, round(overlap * n))]
     i, j = np.repeat(np.arange(n), len(kept)), np.tile(kept, n)
@@ -176,8 +181,11 @@ def _right_matches(
     model: Shape,
     truth: Pose | None,
 ) -> SyntheticProblem:
-    if n < 1 or sigma < 0:
-        raise ValueError(f"received n = {n} and sigma = {sigma}: expected n above 0, sigma 0 or above.")
+    whole_number("n", n, 1, what="the number of points")
+    checked_number("sigma", sigma, NumberRule(least=0))
+    _check_scale(scale)
+    if noise_bound is not None:
+        checked_number("noise_bound", noise_bound, NumberRule(above=0))
     bound = float(BOUND_PER_SIGMA * sigma if noise_bound is None else noise_bound)
     if bound < sigma:
         raise ValueError(f"noise_bound {bound} is below sigma {sigma}: most noise would be drawn again.")
@@ -189,13 +197,21 @@ def _right_matches(
     return SyntheticProblem(src, dst, truth, np.ones(n, bool), bound)
 
 
+def _check_scale(scale: Any) -> None:
+    """Raise ValueError unless this is a scale above 0, or a range of them."""
+    ends = scale if isinstance(scale, tuple) else (scale, scale)
+    numbers = [checked_number("scale", each, NumberRule(above=0)) for each in ends]
+    if len(numbers) != 2 or numbers[0] > numbers[1]:
+        raise ValueError(f"scale is {shown(scale)}: expected one number, or a range (low, high).")
+
+
 def _with_outliers(
     rng: np.random.Generator,
     right: SyntheticProblem,
     rate: Number,
     draw: Callable[[Int[np.ndarray, " k"]], Points],
 ) -> SyntheticProblem:
-    if not 0 <= rate <= 1:
+    if checked_number("outlier_rate", rate, NumberRule(least=0)) > 1:
         raise ValueError(f"outlier_rate is {rate}: expected a share from 0 to 1.")
     n = len(right.src)
     wrong = rng.permutation(n)[: round(rate * n)]
@@ -204,7 +220,8 @@ def _with_outliers(
     place, todo = right.truth.apply(right.src), wrong
     for _ in range(1000):  # a wrong match that happens to be right is drawn again
         dst[todo] = draw(todo)
-        todo = todo[np.linalg.norm(dst[todo] - place[todo], axis=1) <= right.noise_bound]
+        with np.errstate(over="ignore"):  # infinitely far is not near
+            todo = todo[np.linalg.norm(dst[todo] - place[todo], axis=1) <= right.noise_bound]
         if not todo.size:
             return SyntheticProblem(right.src, dst, right.truth, inliers, right.noise_bound)
     raise ValueError(f"noise_bound {right.noise_bound} spans the target: no match could be wrong.")

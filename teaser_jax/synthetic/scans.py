@@ -10,7 +10,7 @@ from jaxtyping import Float, Real
 
 from teaser_jax.ground.arrays import Number
 from teaser_jax.pose import Pose
-from teaser_jax.synthetic.models import Points, Seed
+from teaser_jax.synthetic.models import Points, Seed, generator
 from teaser_jax.synthetic.protocol import draw_rotation
 
 Vector: TypeAlias = Float[np.ndarray, "3"]
@@ -57,7 +57,7 @@ def scan_pair(
     Raises:
         ValueError: As ``partial_scan``.
     """
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     view = _unit(rng.standard_normal(3))
     axis = _unit(np.cross(view, rng.standard_normal(3)))
     angle = np.radians(rng.uniform(*turn))
@@ -110,7 +110,7 @@ def partial_scan(
             f"received n = {n}, sigma = {sigma} and view = {view}: expected n above 0, sigma 0 or above, and "
             "a direction."
         )
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     view = _unit(np.asarray(view, float))
     across = _unit(np.cross(view, rng.standard_normal(3)))
     cell = max(float(np.ptp(model, axis=0).max()), np.finfo(float).tiny) / cells

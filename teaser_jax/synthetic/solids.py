@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float
 
-from teaser_jax.synthetic.models import Points, Seed
+from teaser_jax.synthetic.models import Points, Seed, generator
 from teaser_jax.synthetic.protocol import draw_rotation
 
 Kind = Literal["box", "ball", "rod", "ring", "cone"]
@@ -48,7 +48,7 @@ def random_solid(
     low, high = (parts, parts) if isinstance(parts, int) else parts
     if not 1 <= low <= high or n < 1:
         raise ValueError(f"received parts = {parts} and n = {n}: expected at least one of each.")
-    rng = np.random.default_rng(seed)
+    rng = generator(seed)
     placed = [
         (_PARTS[kinds[int(rng.integers(len(kinds)))]](rng), draw_rotation(rng), rng.uniform(-0.4, 0.4, 3))
         for _ in range(rng.integers(low, high + 1))
