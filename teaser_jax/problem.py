@@ -162,14 +162,16 @@ def read_problem(
     cbar2 = reading.positive_number(cbar2, "cbar2")
     scale = None if scale is None else reading.known_scale(scale)
     reading.check_values(src, dst, noise_bound, mask, confidence, dtype)
+    with np.errstate(over="ignore"):  # rows that are masked or not finite may hold anything
+        rows = [x.astype(dtype) for x in (src, dst, noise_bound, confidence)]
     return Problem(
-        src=src.astype(dtype),
-        dst=dst.astype(dtype),
-        noise_bound=noise_bound.astype(dtype),
-        cbar2=cbar2.astype(dtype),
+        src=rows[0],
+        dst=rows[1],
+        noise_bound=rows[2],
+        cbar2=reading.in_type(cbar2, "cbar2", dtype),
         mask=mask,
-        confidence=confidence.astype(dtype),
-        scale=None if scale is None else scale.astype(dtype),
+        confidence=rows[3],
+        scale=None if scale is None else reading.in_type(scale, "scale", dtype),
         pairs=None if pairs is None else pairs.astype(np.int32),
     )
 

@@ -135,6 +135,15 @@ def known_scale(value: Any) -> AnyArray:
     return positive_number(array, "scale")
 
 
+def in_type(number: AnyArray, name: str, dtype: Any) -> AnyArray:
+    """Convert a number above 0 to a type. Raises ValueError if it is none above 0 there, or infinite."""
+    with np.errstate(over="ignore", under="ignore"):  # of which the error speaks
+        converted = number.astype(dtype)
+    if not is_traced(converted) and not (np.isfinite(converted) and converted > 0):
+        raise ValueError(f"{name} is {number}, which {dtype} cannot hold: give one nearer to 1.")
+    return converted
+
+
 def truth_values(value: Any, n: int) -> AnyArray:
     """Read the mask of the matches, (n,) truth values. Raises ValueError on anything else."""
     array = _read(value, "mask")
@@ -237,7 +246,8 @@ def _lonely_row(src: Any, dst: Any, usable: Any, largest: float) -> str:
     """Name the row to mask where a single one is far beyond the others; otherwise say nothing."""
     reach = np.maximum(np.abs(src[usable]).max(axis=1), np.abs(dst[usable]).max(axis=1))
     row = np.arange(len(src))[usable][np.argmax(reach)]
-    usual = float(np.median(reach.astype(np.float64)))
+    half = len(reach) // 2
+    usual = float(np.partition(reach, half)[half])  # no mean of two, which may be no number any more
     if usual * 1e3 >= largest:
         return ""
     return f". Half of the matches stay within {usual:.3g}: if row {row} is corrupt, mask it"

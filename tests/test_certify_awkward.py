@@ -271,10 +271,13 @@ def test_odd_parameters_are_refused(unchecked, change, words):
         certify_rotation(**known)
 
 
-def test_lengths_beyond_float64_are_undecidable():
+@pytest.mark.parametrize(("size", "bound"), [(1e200, 1e-200), (1, 1e-156), (1, 1e-300)])
+def test_lengths_beyond_float64_are_undecidable(size, bound):
     src, dst, rotation = draw_vectors(0, 6, 0.0)
-    found = certify_rotation(1e200 * src, 1e200 * dst, rotation, noise_bound=1e-200)
+    found = certify_rotation(size * src, size * dst, rotation, noise_bound=bound)
     assert found.status in (CertificateStatus.UNDECIDABLE, CertificateStatus.NO_MEASUREMENTS)
+    assert (found.suboptimality, found.absolute_gap) == (1, 1)
+    assert np.isfinite(found.rotation).all()
     assert not found.is_optimal
     assert found.lower_bound == 0
 

@@ -22,8 +22,6 @@ from fuzzing import (
     BOUND,
     ODD,
     Case,
-    argument_lists,
-    broken_files,
     check_pose,
     draw,
     odd_calls,
@@ -32,6 +30,7 @@ from fuzzing import (
     spoiled,
     stacked,
 )
+from fuzzing_text import argument_lists, broken_files
 
 import teaser_jax as tj
 from teaser_jax import files, learn, settings

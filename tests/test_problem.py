@@ -381,3 +381,23 @@ def test_a_stack_wants_vmap():
     problem = tj.make_problem(np.ones((5, 3)), np.ones((5, 3)), noise_bound=0.1)
     with pytest.raises(ValueError, match="vmap"):
         tj.solve(tj.stack_problems([problem, problem]))
+
+
+@pytest.mark.parametrize(("name", "value"), [("cbar2", 1e75), ("cbar2", 1e-75), ("scale", 1e75)])
+def test_numbers_that_float32_cannot_hold_are_named_and_not_infinite(name, value):
+    with pytest.raises(ValueError, match=f"{name} is 1e.75, which float32 cannot hold"):
+        make(**{name: value})
+    points = np.random.default_rng(0).normal(size=(8, 3))
+    assert getattr(tj.host_problem(points, points, noise_bound=0.1, **{name: value}), name) == value
+
+
+def test_masked_rows_beyond_float32_are_cast_without_a_warning():
+    points, mask = np.random.default_rng(0).normal(size=(8, 3)), np.arange(8) > 0
+    points[0] = 1e300
+    assert tj.make_problem(points, points, noise_bound=0.1, mask=mask).src.dtype == jnp.float32
+
+
+def test_points_at_the_end_of_all_numbers_are_refused_without_a_warning():
+    points = np.full((8, 3), 1.7e308)
+    with pytest.raises(ValueError, match="beyond what float64 can square"):
+        tj.host_problem(points, points, noise_bound=0.1)

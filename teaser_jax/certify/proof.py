@@ -159,7 +159,7 @@ def read_off(
     """
     m, matrix = claim.polished, attempt.matrix
     measured, error = jnp.sum(m.mask), factorisation_error(m, matrix)
-    some, known = measured > 0, jnp.isfinite(claim.given)
+    some, known = measured > 0, jnp.isfinite(claim.given) & jnp.isfinite(error) & jnp.isfinite(lowest)
     zero = some & (claim.given <= ABSOLUTE_TOLERANCE * m.cbar2)
     lower = _lower_bound(claim, measured, lowest)
     lower = jnp.where(some, jnp.where(zero | ~known, 0, lower), claim.given)

@@ -16,6 +16,7 @@ from teaser_jax.cli.places import check_places, draw, failures_named, writing
 from teaser_jax.cli.report import as_plain_data, errors_as_text
 from teaser_jax.files.matches import KNOWN, MatchFile, read_matches
 from teaser_jax.files.poses import write_pose
+from teaser_jax.ground.io import one_line
 from teaser_jax.stages.clique.exact import ExactClique
 
 CHOICES = ("clique", "rotation", "tim_graph", "vote", "refine")  # of Settings
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_places(source, output, plot)
     matches = read_matches(source)
     for sentence in matches.ignored:
-        print(f"teaser-jax: {source}: {sentence}", file=sys.stderr)
+        print(f"teaser-jax: {one_line(source)}: {sentence}", file=sys.stderr)
     given = vars(arguments)
     known = {**matches.known, **{name: value for name, value in given.items() if name in KNOWN}}
     if "noise_bound" not in known:
@@ -50,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     _write(result, matches, output, plot)
     if output is not None and not result.ok:
         what = "not written, and the older file removed" if older else "not written"
-        print(f"teaser-jax: {output} {what}: {result.status.name}", file=sys.stderr)
+        print(f"teaser-jax: {one_line(output)} {what}: {result.status.name}", file=sys.stderr)
     if arguments.json:
         print(json.dumps(as_plain_data(result, matches.truth, seconds), allow_nan=False))
     else:
