@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import teaser_jax as tj
@@ -151,6 +151,7 @@ def test_no_file_and_no_file_but_a_folder(tmp_path):
     content=st.binary(max_size=300) | st.text(max_size=200).map(str.encode),
     suffix=st.sampled_from(["npz", "csv", "txt"]),
 )
+@example(content=b'"', suffix="csv")  # blank, but for a quote
 def test_noise_is_refused_or_read_but_never_crashes(tmp_path, content, suffix):
     path = tmp_path / f"m.{suffix}"
     path.write_bytes(content)

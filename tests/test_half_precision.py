@@ -25,7 +25,7 @@ def assert_float32_and_right(pose: tj.Pose) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("dtype", "solver"), zip(HALVES, [tj.solve, tj.soft_solve], strict=True))
+@pytest.mark.parametrize(("dtype", "solver"), list(zip(HALVES, [tj.solve, tj.soft_solve], strict=True)))
 def test_gradients_under_jit(dtype, solver):
     def total(src, dst, bound):
         found = solver(tj.make_problem(src, dst, noise_bound=bound))

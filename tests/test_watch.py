@@ -16,6 +16,14 @@ from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.watch import PATIENCE, Watch
 
 
+@pytest.fixture(autouse=True)
+def interrupts_are_heard():
+    """Whatever started the tests in the background had them ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def interrupt() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 

@@ -139,7 +139,7 @@ def _read_text(path: Path) -> MatchFile:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise FileError(f"{path}: is not text: expected six columns of numbers.") from None
-    numbered = ((number, line.split("#")[0]) for number, line in enumerate(lines, 1))
+    numbered = ((number, line.split("#")[0].replace('"', "")) for number, line in enumerate(lines, 1))
     rows = [(number, line) for number, line in numbered if line.strip()]
     delimiter = next((d for d in ";,\t|" if rows and d in rows[0][1]), None)
     if rows and _is_header(_fields(rows[0][1], delimiter)):
@@ -151,7 +151,7 @@ def _read_text(path: Path) -> MatchFile:
         raise FileError(f"{path}: holds no match: expected six numbers a row.")
     reason = ""
     try:
-        table = np.loadtxt([line.replace('"', "") for _, line in rows], delimiter=delimiter, ndmin=2)
+        table = np.loadtxt([line for _, line in rows], delimiter=delimiter, ndmin=2)
     except ValueError as error:
         table, reason = np.empty((0, 0)), str(error)
     if table.shape[1] != 6:
@@ -162,7 +162,7 @@ def _read_text(path: Path) -> MatchFile:
 
 
 def _fields(line: str, delimiter: str | None) -> list[str]:
-    return [field.strip().strip('"') for field in line.split(delimiter)]
+    return [field.strip() for field in line.split(delimiter)]
 
 
 def _is_header(fields: list[str]) -> bool:
