@@ -105,6 +105,7 @@ def test_new_numbers_compile_nothing_and_new_caps_do():
         (lambda: ExactClique(seconds=float("nan")), "ExactClique.seconds is nan: expected 0 or more"),
         (lambda: ScaleVote((2, 1)), r"ScaleVote.range is \(2, 1\): expected \(low, high\) with"),
         (lambda: ScaleVote(3), r"ScaleVote.range is 3: expected \(low, high\)"),
+        (lambda: ScaleVote((10**400, 10**401)), r"ScaleVote.range is .*: expected \(low, high\) with"),
         (lambda: Gnc(factor=10**400), "Gnc.factor is 10*...: expected a number above 1"),
         (lambda: Gnc(tolerance=10**5000), "Gnc.tolerance is int of too many digits: expected"),
         (lambda: Gnc(name="mine"), "Gnc.name is 'mine': it is always 'gnc', so leave it out"),

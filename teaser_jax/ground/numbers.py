@@ -147,7 +147,7 @@ def _as_scalar(value: Any) -> Any:
     return np.asarray(value).item() if is_array else value
 
 
-def _as_float(value: Any) -> float:
+def as_float(value: Any) -> float:
     """Convert a number; an integer beyond all floats becomes infinite."""
     try:
         return float(value)
@@ -170,6 +170,6 @@ def checked_number(name: str, value: Any, rule: NumberRule) -> float:
         ValueError: If it is no number, or breaks the rule.
     """
     value = _as_scalar(value)
-    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(_as_float(value)):
+    if isinstance(value, bool | np.bool_) or not isinstance(value, Real) or not rule.admits(as_float(value)):
         raise ValueError(f"{name} is {shown(value)}: expected {rule.words}.")
-    return _as_float(value)
+    return as_float(value)

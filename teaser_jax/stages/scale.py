@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import Placeholder, is_traced, safe_norm, safe_sqrt
 from teaser_jax.ground.checks import shown
-from teaser_jax.ground.numbers import TracedNumber, named
+from teaser_jax.ground.numbers import TracedNumber, as_float, named
 from teaser_jax.stages.pairs import (
     PairSlice,
     fold_pairs,
@@ -48,7 +48,7 @@ class ScaleVote:
         if not isinstance(self.range, tuple) or len(self.range) != 2:
             raise ValueError(f"ScaleVote.range is {shown(self.range)}: expected (low, high).")
         # JAX rebuilds records from placeholders, too: only what is a number is looked at.
-        limits = tuple(float(x) if isinstance(x, Real) else x for x in self.range)
+        limits = tuple(as_float(x) if isinstance(x, Real) else x for x in self.range)
         if any(isinstance(x, str) for x in limits) or all(isinstance(x, float) for x in limits):
             self._check(limits)
         object.__setattr__(self, "range", limits)
