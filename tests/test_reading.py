@@ -95,3 +95,9 @@ def test_clouds_of_open3d_are_read():
         np.testing.assert_allclose(found, points, rtol=1e-6)
     with pytest.raises(ValueError, match="src is empty"):
         tj.register(SimpleNamespace(points=[], has_points=lambda: False), points, noise_bound=0.1)
+
+
+def test_points_at_the_end_of_all_numbers_are_refused_without_a_warning():
+    points = np.full((8, 3), 1.7e308)
+    with pytest.raises(ValueError, match="beyond what float64 can square"):
+        tj.host_problem(points, points, noise_bound=0.1)

@@ -131,11 +131,7 @@ def _add_study(study: argparse.ArgumentParser) -> None:
     study.add_argument(
         "--method", action="append", metavar="M", help="one that takes part, again for more (default: all)"
     )
-    study.add_argument(
-        "--quick",
-        action="store_true",
-        help="a few cells of three runs: two minutes a study",
-    )
+    study.add_argument("--quick", action="store_true", help="a few cells of three runs: two minutes a study")
     study.add_argument(
         "--export", type=Path, metavar="DIR", help="write the problems as .npz shards, and solve nothing"
     )

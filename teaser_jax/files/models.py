@@ -37,10 +37,8 @@ def read_shape(path: str | PathLike[str]) -> Real[np.ndarray, "m 3"] | Triangles
         f"{what}: it is broken, or no {path.suffix or 'file'} that trimesh reads; PLY, OBJ, STL and OFF are"
     )
     with os_errors_named(path, what):
-        if read is _by_numpy:
-            shape = or_file_error(path, what, lambda: read(path))
-        else:
-            shape = or_file_error(path, advice, lambda: read(path), quoting=False)
+        by_us = read is _by_numpy
+        shape = or_file_error(path, what if by_us else advice, lambda: read(path), quoting=by_us)
     points = np.asarray(shape.vertices if isinstance(shape, Triangles) else shape)
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu" or len(points) < 4:
         raise FileError(f"{path}: holds an array of shape {points.shape}: expected (m, 3) points.")
