@@ -17,12 +17,16 @@ from teaser_jax.refit import widened
 from teaser_jax.rows import Rows, arrange, in_rows
 from teaser_jax.settings import Settings
 from teaser_jax.stages.consistency import consistency_graph
+from teaser_jax.stages.one_to_one import OneToOne, one_to_one
 from teaser_jax.stages.scale import ScalePairs, estimate_scale
 from teaser_jax.stages.widening import bound_widening
 
 
 class Graph(NamedTuple):
-    """What is known before the clique: where the rows are, and which; the scale; the bounds; who agrees."""
+    """What is known before the clique: where the rows are, and which; the scale; the bounds; who agrees.
+
+    Matches of one point do not; ``further`` bounds what they may add to a set of others.
+    """
 
     rows: Rows
     mask: Bool[Array, " n"]
@@ -30,6 +34,7 @@ class Graph(NamedTuple):
     scale_pairs: ScalePairs | None
     widening: Float[Array, ""]
     edge_bits: UInt32[Array, "n w"]
+    further: Float[Array, " n"]
 
 
 def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
@@ -39,7 +44,7 @@ def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run 
     scale, scale_pairs = run("scale", find_scale, p, settings)
     widening = run("widening", find_widening, p, scale, settings, dtype=edge_dtype)
     edges = run("consistency graph", find_edges, widened(p, widening), scale, dtype=edge_dtype)
-    return Graph(rows, p.mask, scale, scale_pairs, widening, edges)
+    return Graph(rows, p.mask, scale, scale_pairs, widening, *edges)
 
 
 def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScalePairs | None]:
@@ -63,10 +68,11 @@ def find_widening(
     return wide.astype(p.src.dtype)
 
 
-def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> UInt32[Array, "n w"]:
-    """Find the consistency graph at a scale, tested in ``dtype`` (None: that of the problem)."""
+def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> OneToOne:
+    """Find who agrees with whom at a scale, tested in ``dtype`` (None: that of the problem)."""
     src, dst, noise_bound, scale, cbar2 = _as(dtype, p.src, p.dst, p.noise_bound, scale, p.cbar2)
-    return consistency_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
+    edges = consistency_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
+    return one_to_one(edges, src, dst, p.mask)
 
 
 def _as(dtype: Any, *arrays: Array) -> list[Array]:

@@ -31,6 +31,7 @@ from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Selection, Solution, as_asked, with_rows
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import maximum_clique
+from teaser_jax.stages.one_to_one import bound_on_rows
 from teaser_jax.stages.refinement import Refinement, refine, squared_residuals, truncated_cost
 from teaser_jax.stages.verdict import evidence_of, status_of
 
@@ -144,7 +145,7 @@ def conclude(
         inliers=selection.inliers,
         status=status,
         clique_size=size,
-        clique_upper_bound=clique.upper_bound,
+        clique_upper_bound=bound_on_rows(clique.upper_bound, graph.further, graph.mask),
         clique_is_maximum=(size == clique.upper_bound) & settings.clique.prunes,
         excluded=excluded,
         cost=truncated_cost(squared_residuals(pose, p.src, p.dst, p.noise_bound), p.mask, p.cbar2),

@@ -18,7 +18,7 @@ ORDER = [
     "ground.bits", "ground.masked", "ground.io", "ground.steps",
     "so3", "pose", "reading", "problem", "rows", "solution",
     "stages.pairs", "stages.vote.sweep", "stages.vote.histogram", "stages.scale", "stages.consistency",
-    "stages.widening",
+    "stages.one_to_one", "stages.widening",
     "stages.clique.clique", "stages.clique.every_match", "stages.clique.greedy", "stages.clique.oracle",
     "stages.clique.reduction", "stages.clique.branching", "stages.clique.watch", "stages.clique.exact",
     "stages.clique.maximum",

@@ -113,6 +113,14 @@ def test_stages_with_nothing_to_show():
         figure.savefig(io.BytesIO(), format="png", dpi=40)
 
 
+def test_residuals_without_a_number_are_beyond_all():
+    figure = plots.plot_residuals(np.array([0.1, 0.2, np.nan, np.inf]), np.array([True, True, False, False]))
+    heights = [bar.get_height() for bar in figure.axes[0].patches]
+    assert heights[59] == 0  # nothing kept in the last bar
+    assert heights[119] == 2
+    drawn(figure)
+
+
 def test_without_matplotlib_the_extra_is_named(monkeypatch, small, solved):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"teaser-jax\[viz\]"):
@@ -154,6 +162,9 @@ def test_slopes_errors_and_training_are_drawn():
     shares = [float(axes.get_title().split(": ")[1].split(" %")[0]) for axes in figure.axes]
     np.testing.assert_allclose(shares, 95, atol=1.5)
     drawn(figure)
+    for unknown in (np.full((6, 6), np.inf), np.zeros((6, 6))):
+        with pytest.raises(ValueError, match="not ok"):
+            plots.plot_errors(errors, unknown)
     trusted = rng.random((50, 4)) < 0.5
     history = tj.learn.History(rng.random(50), trusted, np.where(trusted, 0.0, 1.0))
     figure = plots.plot_training({"one": history, "other": history})

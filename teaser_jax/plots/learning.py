@@ -75,8 +75,14 @@ def plot_errors(
 
     Raises:
         ImportError: If matplotlib is missing.
+        ValueError: If the covariance is of no ellipse, as that of an answer that is not ok.
     """
     errors, covariance = np.asarray(errors), np.asarray(covariance)
+    if not np.all(np.isfinite(covariance)) or np.linalg.eigvalsh(covariance)[0] <= 0:
+        raise ValueError(
+            "the covariance is not finite and positive definite, so it has no ellipse: nothing is known of "
+            "an answer that is not ok."
+        )
     figure = new_figure((10, 4))
     parts = (
         ("Turn", (0, 1), 180 / np.pi, "deg"), ("Shift", (3, 4), 1.0, unit), ("Both", (0, 4), 1.0, "")

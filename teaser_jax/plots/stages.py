@@ -157,7 +157,7 @@ def plot_residuals(
     The truncation is the dashed line; the last bar holds all that lie beyond.
 
     Args:
-        squared: r^2 / delta^2 of each measurement [-].
+        squared: r^2 / delta^2 of each measurement [-]; what is no number counts as beyond all.
         kept: Those with weight 1 in the end.
         cbar2: Truncation [-].
         of: What was measured, for the title.
@@ -165,10 +165,12 @@ def plot_residuals(
     Raises:
         ImportError: If matplotlib is missing.
     """
-    size, kept = np.sqrt(np.asarray(squared, float)), np.asarray(kept, bool)
+    squared, kept = np.asarray(squared, float), np.asarray(kept, bool)
+    size = np.sqrt(np.where(np.isnan(squared), np.inf, squared))
+    finite = size[np.isfinite(size)]
     figure = new_figure((6.4, 3.4))
     axes = figure.subplots()
-    limit = max(2.0 * np.sqrt(cbar2), float(np.quantile(size, 0.98)) if size.size else 0.0)
+    limit = max(2.0 * np.sqrt(cbar2), float(np.quantile(finite, 0.98)) if finite.size else 0.0)
     sets = [np.minimum(size[kept], limit), np.minimum(size[~kept], limit)]
     labels = [f"kept ({kept.sum()})", f"rejected ({(~kept).sum()})"]
     axes.set_xlim(0, limit)

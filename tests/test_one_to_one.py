@@ -1,0 +1,106 @@
+"""Matches of one point are one piece of evidence: against a dense oracle, and where a patch meets a point."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from oracles import clique_number, pack, random_graph, random_rotation, solve, unpack
+
+import teaser_jax as tj
+from teaser_jax.stages.one_to_one import bound_on_rows, one_to_one
+
+N = 40
+ONE = jax.jit(one_to_one)
+MANY = jax.jit(jax.vmap(one_to_one))
+BOUND = jax.jit(bound_on_rows)
+
+
+def some_matches(seed: int, repeat: bool):
+    """A random graph on matches, points of which repeat or not, and some that are masked."""
+    rng = np.random.default_rng(seed)
+    src, dst = rng.normal(size=(2, N, 3))
+    if repeat:
+        src, dst = src[rng.integers(0, 12, N)], dst[rng.integers(0, 25, N)]
+        src[:2], dst[2:4] = [[0.0, 0, 0], [-0.0, 0, 0]], 1.0  # zeros of both signs are one point
+    mask = rng.random(N) < 0.9
+    dense = random_graph(rng, N, 0.7) & mask[:, None] & mask
+    return dense, src.astype(np.float32), dst.astype(np.float32), mask
+
+
+def without_shared(dense, src, dst) -> np.ndarray:
+    alike = [(points[:, None] == points).all(axis=2) for points in (src, dst)]
+    return dense & ~alike[0] & ~alike[1]
+
+
+@pytest.mark.parametrize("repeat", [True, False])
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_between_matches_of_one_point_go_and_the_bound_stays_one(seed, repeat):
+    dense, src, dst, mask = some_matches(seed, repeat)
+    found = ONE(pack(dense), src, dst, mask)
+    wanted = without_shared(dense, src, dst)
+    assert (wanted.sum() < dense.sum()) == repeat
+    np.testing.assert_array_equal(unpack(found.edge_bits, N), wanted)
+    apart, together = clique_number(wanted), clique_number(dense)
+    bound = int(BOUND(np.int32(apart), found.further, mask))
+    assert apart <= together <= bound <= mask.sum()
+    if repeat:
+        assert together > apart
+    else:
+        assert bound == apart
+
+
+def test_a_batch_is_thinned_as_its_problems_are():
+    problems = [some_matches(seed, repeat=seed % 2 == 0) for seed in range(4)]
+    edges, *rest = (np.stack(x) for x in zip(*problems, strict=True))
+    together = MANY(np.stack([pack(each) for each in edges]), *rest)
+    for k, (dense, *points) in enumerate(problems):
+        alone = ONE(pack(dense), *points)
+        np.testing.assert_array_equal(together.edge_bits[k], alone.edge_bits)
+        np.testing.assert_array_equal(together.further[k], alone.further)
+
+
+def test_the_bound_on_rows_never_exceeds_them():
+    mask, further = np.ones(5, bool), np.array([4, 8, 8, 8, 3e38], np.float32)
+    assert [int(BOUND(np.int32(k), further, mask)) for k in range(6)] == [0, 5, 5, 5, 5, 5]
+
+
+def patch_to_point(seed: int, turned_round: bool):
+    """105 right matches, 45 wrong ones, and 200 that lead from a patch within the noise to one point."""
+    rng = np.random.default_rng(seed)
+    truth = tj.Pose(random_rotation(rng), rng.normal(size=3), 1.0)
+    src = rng.normal(size=(150, 3))
+    dst = truth.apply(src) + rng.uniform(-0.01, 0.01, (150, 3))
+    dst[105:] = rng.normal(size=(45, 3))
+    patch = rng.normal(size=3) + rng.uniform(-0.01, 0.01, (200, 3))
+    more = [patch, np.tile(rng.normal(size=3), (200, 1))]
+    if turned_round:
+        more.reverse()
+    return np.r_[src, more[0]], np.r_[dst, more[1]], truth
+
+
+@pytest.mark.parametrize("turned_round", [False, True], ids=["many to one", "one to many"])
+def test_a_patch_that_meets_one_point_hides_no_right_matches(turned_round):
+    for seed in range(5):
+        src, dst, truth = patch_to_point(seed, turned_round)
+        result = tj.register(src, dst, noise_bound=0.02)
+        assert result.ok
+        assert tj.metrics.errors(result, truth).rotation_deg < 0.2
+        assert result.inliers[:105].all()
+        assert result.inliers.sum() <= 107
+        # Of the patch no match can be among the others of a clique but with one of them.
+        solution = result.solution
+        assert solution.clique_is_maximum
+        assert solution.clique_upper_bound >= 200
+        assert result.certificate.inlier_gap >= 200 - result.inliers.sum()
+
+
+def test_inside_jit_and_in_a_batch_too(x64):
+    problems = [tj.host_problem(*patch_to_point(k, k == 1)[:2], noise_bound=0.02) for k in range(2)]
+    together = tj.solve_batch(problems)
+    for problem, there in zip(problems, together, strict=True):
+        alone = solve(problem)
+        assert there.ok
+        assert alone.ok
+        np.testing.assert_array_equal(alone.inliers, there.inliers)
+        assert alone.clique_upper_bound == there.clique_upper_bound
