@@ -17,7 +17,7 @@ from teaser_jax.refit import widened
 from teaser_jax.rows import Rows, arrange, in_rows
 from teaser_jax.settings import Settings
 from teaser_jax.stages.consistency import consistency_graph
-from teaser_jax.stages.one_to_one import OneToOne, one_to_one
+from teaser_jax.stages.one_to_one import OneToOne, one_to_one_graph
 from teaser_jax.stages.scale import ScalePairs, estimate_scale
 from teaser_jax.stages.widening import bound_widening
 
@@ -71,8 +71,10 @@ def find_widening(
 def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> OneToOne:
     """Find who agrees with whom at a scale, tested in ``dtype`` (None: that of the problem)."""
     src, dst, noise_bound, scale, cbar2 = _as(dtype, p.src, p.dst, p.noise_bound, scale, p.cbar2)
+    if p.pairs is None:
+        return one_to_one_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2)
     edges = consistency_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
-    return one_to_one(edges, src, dst, p.mask)
+    return OneToOne(edges, jnp.zeros(p.mask.shape, jnp.float32))  # pairs that nobody names exclude nothing
 
 
 def _as(dtype: Any, *arrays: Array) -> list[Array]:

@@ -11,9 +11,7 @@ import pytest
 from teaser_jax.ground import bits
 
 # One program each instead of one an operation.
-pack, count, rank, listed, first_set = (
-    jax.jit(f) for f in (bits.pack, bits.count, bits.rank, bits.listed, bits.first_set)
-)
+pack, count, rank, listed = (jax.jit(f) for f in (bits.pack, bits.count, bits.rank, bits.listed))
 unpack, others = jax.jit(bits.unpack, static_argnames="n"), jax.jit(bits.others, static_argnames="n")
 
 SIZES = [0, 1, 31, 32, 33, 64, 100]
@@ -42,14 +40,6 @@ def test_unpacking_undoes_packing(n):
 @pytest.mark.parametrize("n", SIZES)
 def test_counting_counts(n):
     np.testing.assert_array_equal(count(pack(mask_of(n))), mask_of(n).sum(axis=1))
-
-
-@pytest.mark.parametrize("n", [1, 33, 64, 100])
-def test_the_first_bit_of_a_row_is_found(n):
-    mask = np.random.default_rng(n).uniform(size=(n, n)) < 2 / n
-    mask[0], mask[-1] = False, np.arange(n) == n - 1
-    expected = [np.flatnonzero(row)[0] if row.any() else n for row in mask]
-    np.testing.assert_array_equal(first_set(pack(mask)), expected)
 
 
 def test_bit_t_of_word_j_is_column_32_j_plus_t():

@@ -3,29 +3,40 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from oracles import clique_number, pack, random_graph, random_rotation, solve, unpack
+from oracles import clique_number, length_gaps, random_rotation, solve, unpack
 
 import teaser_jax as tj
-from teaser_jax.stages.one_to_one import bound_on_rows, one_to_one
+from teaser_jax.stages.one_to_one import bound_on_rows, one_to_one_graph
 
 N = 40
-ONE = jax.jit(one_to_one)
-MANY = jax.jit(jax.vmap(one_to_one))
+
+
+def graph(src, dst, noise_bound, mask):
+    one = jnp.float32(1)
+    return one_to_one_graph(src, dst, noise_bound, mask, scale=one, cbar2=one)
+
+
+ONE, MANY = jax.jit(graph), jax.jit(jax.vmap(graph))
 BOUND = jax.jit(bound_on_rows)
 
 
 def some_matches(seed: int, repeat: bool):
-    """A random graph on matches, points of which repeat or not, and some that are masked."""
+    """Matches that agree as often as not, on points of which some repeat or none; some are masked."""
     rng = np.random.default_rng(seed)
     src, dst = rng.normal(size=(2, N, 3))
     if repeat:
         src, dst = src[rng.integers(0, 12, N)], dst[rng.integers(0, 25, N)]
         src[:2], dst[2:4] = [[0.0, 0, 0], [-0.0, 0, 0]], 1.0  # zeros of both signs are one point
-    mask = rng.random(N) < 0.9
-    dense = random_graph(rng, N, 0.7) & mask[:, None] & mask
-    return dense, src.astype(np.float32), dst.astype(np.float32), mask
+    bounds = rng.uniform(0.1, 1.5, N)
+    return src.astype(np.float32), dst.astype(np.float32), bounds.astype(np.float32), rng.random(N) < 0.9
+
+
+def all_edges(src, dst, bounds, mask) -> np.ndarray:
+    off = mask[:, None] & mask & ~np.eye(N, dtype=bool)
+    return (length_gaps(src, dst) <= bounds[:, None] + bounds) & off
 
 
 def without_shared(dense, src, dst) -> np.ndarray:
@@ -36,8 +47,9 @@ def without_shared(dense, src, dst) -> np.ndarray:
 @pytest.mark.parametrize("repeat", [True, False])
 @pytest.mark.parametrize("seed", range(4))
 def test_edges_between_matches_of_one_point_go_and_the_bound_stays_one(seed, repeat):
-    dense, src, dst, mask = some_matches(seed, repeat)
-    found = ONE(pack(dense), src, dst, mask)
+    src, dst, bounds, mask = some_matches(seed, repeat)
+    found = ONE(src, dst, bounds, mask)
+    dense = all_edges(src, dst, bounds, mask)
     wanted = without_shared(dense, src, dst)
     assert (wanted.sum() < dense.sum()) == repeat
     np.testing.assert_array_equal(unpack(found.edge_bits, N), wanted)
@@ -50,12 +62,21 @@ def test_edges_between_matches_of_one_point_go_and_the_bound_stays_one(seed, rep
         assert bound == apart
 
 
+def test_what_a_point_may_add_is_what_agrees_with_one_of_its_matches():
+    """Three matches of one source and two of one target, of which one is too far off to agree."""
+    rng = np.random.default_rng(0)
+    src, dst = rng.normal(size=(2, 8, 3)).astype(np.float32)
+    src[:3], dst[6:] = src[0], dst[7]
+    dst[1], dst[2], src[6] = dst[0] + 0.01, dst[0] + 5, src[7] + 0.01
+    found = ONE(src, dst, np.full(8, 0.05, np.float32), np.ones(8, bool))
+    np.testing.assert_array_equal(found.further, [2, 2, 2, 2, 2, 2, 2, 2])
+
+
 def test_a_batch_is_thinned_as_its_problems_are():
     problems = [some_matches(seed, repeat=seed % 2 == 0) for seed in range(4)]
-    edges, *rest = (np.stack(x) for x in zip(*problems, strict=True))
-    together = MANY(np.stack([pack(each) for each in edges]), *rest)
-    for k, (dense, *points) in enumerate(problems):
-        alone = ONE(pack(dense), *points)
+    together = MANY(*(np.stack(x) for x in zip(*problems, strict=True)))
+    for k, problem in enumerate(problems):
+        alone = ONE(*problem)
         np.testing.assert_array_equal(together.edge_bits[k], alone.edge_bits)
         np.testing.assert_array_equal(together.further[k], alone.further)
 

@@ -75,13 +75,6 @@ def count(packed: UInt32[Array, "*k w"]) -> Int[Array, "*k"]:
     return jnp.sum(lax.population_count(packed), axis=-1, dtype=jnp.int32)
 
 
-def first_set(packed: UInt32[Array, "n w"]) -> Int[Array, " n"]:
-    """Find the first bit that is set in each row; n where none is."""
-    lowest = lax.population_count((packed & -packed) - 1).astype(jnp.int32)  # of each word: its lowest bit
-    column = LANES * jnp.arange(packed.shape[1], dtype=jnp.int32)[None] + lowest
-    return jnp.min(jnp.where(packed != 0, column, len(packed)), axis=1, initial=len(packed))
-
-
 def rank(mask: Bool[Array, " n"]) -> Int[Array, " n"]:
     """Count the bits set up to and including each: a running sum in two small products.
 

@@ -57,6 +57,24 @@ def lengths_agree(
     return difference**2 <= tolerance2 * (jnp.maximum(2 * total - tolerance2, total) + rounding)
 
 
+def reach_of(
+    src: Float[Array, "n 3"],
+    dst: Float[Array, "n 3"],
+    noise_bound: Float[Array, " n"],
+    mask: Bool[Array, " n"],
+    scale: Float[Array, ""],
+    cbar2: Float[Array, ""],
+) -> Float[Array, " n"]:
+    """Find how far each match may be off, rounding included: two agree within the sum of both [length]."""
+    return jnp.sqrt(cbar2) * noise_bound + rounding_margin(src, dst, mask, scale) / 2
+
+
+def are_zero(components: tuple[Float[Array, "*k"], ...]) -> Bool[Array, "*k"]:
+    """Tell which vectors, given by component, join equal points."""
+    x, y, z = components
+    return (x == 0) & (y == 0) & (z == 0)
+
+
 def consistency_graph(
     src: Float[Array, "n 3"],
     dst: Float[Array, "n 3"],
@@ -66,12 +84,14 @@ def consistency_graph(
     scale: Float[Array, ""],
     cbar2: Float[Array, ""],
     pairs: Int[Array, "m 2"] | None = None,
+    one_to_one: bool = False,
 ) -> UInt32[Array, "n w"]:
     """Find edges between matches with | |b_ij| - s |a_ij| | <= c (beta_i + beta_j), as packed bit rows.
 
     Bit t of word j in row i is the edge (i, 32 j + t); the rows are symmetric, without loops, and
     empty for masked matches. With ``pairs`` only those are tested and every other pair counts as
-    consistent: a pair that was not tested excludes nothing.
+    consistent: a pair that was not tested excludes nothing. With ``one_to_one``, and no pairs, matches of
+    one point of either cloud have no edge.
 
     Gradients: none; inputs are stopped.
 
@@ -79,8 +99,7 @@ def consistency_graph(
     """
     src, dst, noise_bound, scale, cbar2 = lax.stop_gradient((src, dst, noise_bound, scale, cbar2))
     n = src.shape[0]
-    margin = rounding_margin(src, dst, mask, scale)
-    scaled, reach = scale * src, jnp.sqrt(cbar2) * noise_bound + margin / 2
+    scaled, reach = scale * src, reach_of(src, dst, noise_bound, mask, scale, cbar2)
 
     if pairs is None:
 
@@ -88,6 +107,8 @@ def consistency_graph(
             edge = lengths_agree(
                 squared_norm(visited.src_tims), squared_norm(visited.dst_tims), visited.bounds
             )
+            if one_to_one:
+                edge &= ~(are_zero(visited.src_tims) | are_zero(visited.dst_tims))
             return bits.with_lane(rows, lane, edge)
 
         # Masked matches reach NaN far, which spares a test in each of n^2 pairs.

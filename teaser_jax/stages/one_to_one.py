@@ -19,11 +19,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.rows import keys
-from teaser_jax.stages.pairs import PairSlice, fold_pairs
+from teaser_jax.stages.consistency import consistency_graph, reach_of
 
 
 class OneToOne(NamedTuple):
-    """A consistency graph without the edges between matches of one point, and what these may add.
+    """A consistency graph without edges between matches of one point, and what these may add.
 
     Attributes:
         edge_bits: Packed bit rows.
@@ -35,26 +35,30 @@ class OneToOne(NamedTuple):
     further: Float[Array, " n"]
 
 
-def one_to_one(
-    edge_bits: UInt32[Array, "n w"],
+def one_to_one_graph(
     src: Float[Array, "n 3"],
     dst: Float[Array, "n 3"],
+    noise_bound: Float[Array, " n"],
     mask: Bool[Array, " n"],
+    *,
+    scale: Float[Array, ""],
+    cbar2: Float[Array, ""],
 ) -> OneToOne:
-    """Take the edges between matches of one point out of a consistency graph.
-
-    Costs next to nothing where no point is in two matches; in a batch, where none is in any problem.
+    """Find the consistency graph of matches, in which those of one point do not agree.
 
     Args:
-        edge_bits: Packed bit rows of the graph.
-        src, dst: Clean matches [length].
+        src, dst: Clean matches, row i with row i [length].
+        noise_bound: beta_i [length of the target].
         mask: Rows to use.
+        scale: Known or voted [-].
+        cbar2: Truncation [-].
 
-    Gradients: none; inputs must be stopped by the caller.
+    Gradients: none; inputs are stopped.
+
+    References: section VI-D for the graph.
     """
-    if mask.shape[0] == 0:
-        return _as_it_is(edge_bits, src, dst, mask)
-    return OneToOne(*_thinned(edge_bits, src, dst, mask))
+    inputs = lax.stop_gradient((src, dst, noise_bound, mask, scale, cbar2))
+    return _without_shared_points(*inputs) if mask.shape[0] == 0 else OneToOne(*_graph(*inputs))
 
 
 def bound_on_rows(
@@ -76,55 +80,74 @@ def bound_on_rows(
 
 
 @custom_vmap
-def _thinned(*inputs: Any) -> OneToOne:
-    return lax.cond(_has_shared_points(*inputs), _without_shared_points, _as_it_is, *inputs)
+def _graph(*inputs: Any) -> OneToOne:
+    return lax.cond(_has_shared_points(*inputs[:4]), _with_shared_points, _without_shared_points, *inputs)
 
 
-@_thinned.def_vmap
-def _thinned_of_many(size: int, batched: Any, *inputs: Any) -> tuple[OneToOne, OneToOne]:
+@_graph.def_vmap
+def _graphs(size: int, batched: Any, *inputs: Any) -> tuple[OneToOne, OneToOne]:
     # One question for the whole batch: under a plain vmap all would pay for both answers.
     each = [
         x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
         for x, has_axis in zip(inputs, batched, strict=True)
     ]
     # This may be traced after the block that allowed float64 has ended: its numbers must stay what they are.
-    with jax.enable_x64(True) if inputs[1].dtype == jnp.float64 else nullcontext():
-        some = jnp.any(jax.vmap(_has_shared_points)(*each))
-        found = lax.cond(some, jax.vmap(_without_shared_points), jax.vmap(_as_it_is), *each)
+    with jax.enable_x64(True) if inputs[0].dtype == jnp.float64 else nullcontext():
+        some = jnp.any(jax.vmap(_has_shared_points)(*each[:4]))
+        found = lax.cond(some, jax.vmap(_with_shared_points), jax.vmap(_without_shared_points), *each)
     return found, OneToOne(True, True)  # type: ignore[arg-type]  # which of them have the axis
 
 
-def _has_shared_points(edge_bits: Array, src: Array, dst: Array, mask: Array) -> Bool[Array, ""]:
+def _has_shared_points(src: Array, dst: Array, noise_bound: Array, mask: Array) -> Bool[Array, ""]:
     """Tell whether two usable matches may have a point in common: never no where they have."""
     unusable = jnp.uint32(0xFFFFFFFF)
     key = jax.vmap(lambda points: jnp.sort(jnp.where(mask, keys(points.T), unusable)))(jnp.stack([src, dst]))
     return jnp.any((key[:, 1:] == key[:, :-1]) & (key[:, 1:] != unusable))
 
 
-def _as_it_is(edge_bits: Array, src: Array, dst: Array, mask: Array) -> OneToOne:
-    return OneToOne(edge_bits, jnp.zeros(mask.shape, jnp.float32))
+def _without_shared_points(
+    src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
+) -> OneToOne:
+    edges = consistency_graph(src, dst, noise_bound, mask, scale=scale, cbar2=cbar2)
+    return OneToOne(edges, jnp.zeros(mask.shape, jnp.float32))
 
 
-def _without_shared_points(edge_bits: Array, src: Array, dst: Array, mask: Array) -> OneToOne:
-    shared, further = jax.vmap(lambda points: _shared(edge_bits, points, mask))(jnp.stack([src, dst]))
-    return OneToOne(edge_bits & ~shared[0] & ~shared[1], further[0] + further[1])
+def _with_shared_points(
+    src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
+) -> OneToOne:
+    edges = consistency_graph(src, dst, noise_bound, mask, scale=scale, cbar2=cbar2, one_to_one=True)
+    reach = jnp.where(mask, reach_of(src, dst, noise_bound, mask, scale, cbar2), jnp.nan)
+    here, there = jnp.stack([src, dst]), jnp.stack([dst, scale * src])
+    return OneToOne(edges, jnp.sum(jax.vmap(_further, (0, 0, None))(here, there, reach), axis=0))
 
 
-def _shared(edge_bits: Array, points: Array, mask: Array) -> tuple[UInt32[Array, "n w"], Float[Array, " n"]]:
-    """Find which matches share a point of one cloud, and what that may add to a set that has each point once.
+def _further(points: Array, partners: Array, reach: Array) -> Float[Array, " n"]:
+    """Find what matches that share a point of one cloud may add to a set that has each of its points once.
 
     Take matches out of a clique, each point once, until no more can be taken. Each one that is left has
-    a point in common with one of those, and agrees with it. The taken ones are of k different points, so the
-    k largest of these counts bound the rest: a count for each point, that of whichever match has most.
+    a point in common with one of those, and agrees with it: their partners lie within the reach of both. The
+    taken ones are of k different points, so the k largest of these counts bound the rest: a count for each
+    point, that of whichever of its matches has most.
     """
+    n, usable = reach.shape[0], ~jnp.isnan(reach)
+    # Equal points side by side, and what is not used at the end.
+    coordinates = jnp.where(usable[None], jnp.where(points == 0, jnp.zeros_like(points), points).T, jnp.inf)
+    *ordered, order = lax.sort((*coordinates, jnp.arange(n, dtype=jnp.int32)), num_keys=3)
+    same = jnp.stack([x[1:] == x[:-1] for x in ordered]).all(axis=0) & usable[order][1:]
+    point = bits.rank(jnp.pad(~same, (1, 0), constant_values=True)) - 1
+    one = (point, reach[order], *partners[order].T)
+    beyond = [jnp.concatenate([x, jnp.full_like(x, -1)]) for x in one]  # behind the last there is no point
 
-    def mark(rows: Array, lane: Array, visited: PairSlice) -> Array:
-        x, y, z = visited.src_tims
-        return bits.with_lane(rows, lane, (x == 0) & (y == 0) & (z == 0) & visited.valid)
+    def compare(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        apart, counts, _ = state
+        other = [lax.dynamic_slice_in_dim(x, apart, n) for x in beyond]
+        alike = other[0] == point
+        within2 = 1.001 * (one[1] + other[1]) ** 2  # for a bound, rather too many than too few
+        agree = alike & (sum((y - x) ** 2 for x, y in zip(one[2:], other[2:], strict=True)) <= within2)
+        behind = lax.dynamic_slice_in_dim(jnp.pad(agree, (n, 0)), n - apart, n)
+        return apart + 1, counts + agree.astype(jnp.int32) + behind.astype(jnp.int32), jnp.any(alike)
 
-    n = mask.shape[0]
-    shared = fold_pairs(mark, bits.no_bits(n), points, points, jnp.zeros_like(points[:, 0]), mask)
-    counts = bits.count(edge_bits & shared)
-    first = jnp.minimum(bits.first_set(shared), jnp.arange(n, dtype=jnp.int32))
-    of_points = jnp.zeros(n, jnp.int32).at[first].max(counts)
-    return shared, jnp.cumsum(-jnp.sort(-of_points).astype(jnp.float32))
+    start = jnp.int32(1), jnp.zeros(n, jnp.int32), jnp.ones((), bool)
+    counts = lax.while_loop(lambda state: state[2] & (state[0] < n), compare, start)[1]
+    most = jnp.zeros(n, jnp.int32).at[point].max(counts)
+    return jnp.cumsum(-jnp.sort(-most).astype(jnp.float32))
