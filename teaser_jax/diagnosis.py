@@ -107,8 +107,8 @@ def likely_scales(problem: Problem, usable: np.ndarray) -> list[float]:
     logs = np.sort(np.log(b[tell] / a[tell]))
     width = float(np.median(reach[tell] / b[tell]))
 
-    def within(distance: float) -> np.ndarray:
-        return np.searchsorted(logs, logs + distance) - np.searchsorted(logs, logs - distance)
+    def within(distance: float) -> np.ndarray:  # itself at least, however small the distance
+        return np.searchsorted(logs, logs + distance, side="right") - np.searchsorted(logs, logs - distance)
 
     usual = within(5 * width) / 5
     excess = (within(width) - usual) / np.sqrt(usual)

@@ -29,6 +29,12 @@ def test_a_forgotten_scale_is_named(scale, rate):
     assert registered(drawn, scale=None).ok
 
 
+def test_where_bounds_are_nothing_beside_the_lengths_no_warning_leaks():
+    result = registered(tj.synthetic.random_problem(0, n=20, outlier_rate=1.0), cbar2=1e-300)
+    assert result.status == tj.Status.TOO_FEW_POINTS
+    assert "cbar2" in result.advice
+
+
 def test_no_scale_is_named_where_there_is_none():
     wrong = tj.synthetic.random_problem(5, n=N, outlier_rate=1.0)
     for scale in (1.0, None):
