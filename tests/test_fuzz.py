@@ -38,7 +38,7 @@ from teaser_jax.cli import main
 from teaser_jax.cli.arguments import parser
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("unchecked")]
-# Of each door, and an eighth of it where a call takes many milliseconds: two minutes in all. Before a release,
+# Of each door, and an eighth of it where a call takes many milliseconds: two minutes in all. Before a release
 # and after a change of a door, TEASER_JAX_FUZZ=20000 takes some twelve.
 INPUTS = int(os.environ.get("TEASER_JAX_FUZZ", 3_000))
 TOGETHER = 500  # problems in a batch
