@@ -158,6 +158,7 @@ def test_after_warmup_certificates_compile_nothing():
     listening.clear()
 
 
+@pytest.mark.long
 def test_an_answer_of_register_stands_for_problem_and_solution(small, solved):
     for ask in (tj.certify, tj.error_bounds, tj.covariance):
         alone, both = ask(solved), ask(solved.problem, solved.solution)

@@ -62,6 +62,7 @@ def test_bounds_in_two_units_are_named():
     )
 
 
+@pytest.mark.long
 def test_pairs_taken_for_correspondences_are_named():
     order = np.random.default_rng(0).permutation(N)
     dst = np.empty_like(RIGHT.dst)

@@ -39,6 +39,7 @@ def test_inside_jit(name):
             assert all(np.isfinite(x) for x in gradient.values()), (name, end)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["a line", "a plane", "half of the points equal"])
 def test_bounds_and_covariance_of_shapes_that_determine_little(shape):
     rng = np.random.default_rng(0)

@@ -52,6 +52,7 @@ def test_the_first_example_and_the_other_doors(flags):
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+@pytest.mark.long
 def test_a_platform_that_is_not_there_is_named():
     done = ran(
         "import jax\njax.config.update('jax_platforms', 'nonsense')\nimport teaser_jax as tj\n"

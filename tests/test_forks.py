@@ -83,6 +83,7 @@ def test_every_door_refuses_a_child_of_a_process_that_used_the_package():
     ran(DOORS)
 
 
+@pytest.mark.long
 @needs_fork
 @pytest.mark.parametrize(
     "use",

@@ -165,6 +165,7 @@ def test_turning_the_target_turns_the_answer():
     np.testing.assert_array_equal(turned.members, plain.members)
 
 
+@pytest.mark.long
 def test_float32_with_tolerances_of_its_own():
     with jax.enable_x64(False):
         for seed in range(5):

@@ -100,6 +100,7 @@ def patch_to_point(seed: int, turned_round: bool):
     return np.r_[src, more[0]], np.r_[dst, more[1]], truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turned_round", [False, True], ids=["many to one", "one to many"])
 def test_a_patch_that_meets_one_point_hides_no_right_matches(turned_round):
     for seed in range(5):
@@ -116,6 +117,7 @@ def test_a_patch_that_meets_one_point_hides_no_right_matches(turned_round):
         assert result.certificate.inlier_gap >= 200 - result.inliers.sum()
 
 
+@pytest.mark.long
 def test_inside_jit_and_in_a_batch_too(x64):
     problems = [tj.host_problem(*patch_to_point(k, k == 1)[:2], noise_bound=0.02) for k in range(2)]
     together = tj.solve_batch(problems)

@@ -19,6 +19,7 @@ def two() -> tuple[Pose, Pose]:
     return random_pose(rng, 1.3), random_pose(rng, 0.8)
 
 
+@pytest.mark.long
 def test_a_matrix_stands_for_a_pose(two, solved, tmp_path):
     a, b = two
     forms = (np.asarray, lambda p: p.matrix, lambda p: p.matrix[:3], lambda p: p.matrix.tolist())

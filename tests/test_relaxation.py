@@ -84,6 +84,7 @@ def test_a_dual_in_another_frame_proves_the_same(x64):
     np.testing.assert_allclose(np.linalg.eigvalsh(there), np.linalg.eigvalsh(here), atol=1e-9)
 
 
+@pytest.mark.long
 def test_too_many_and_inside_jit_are_refused(small):
     many = np.ones((MAX_RELAXED + 1, 3))
     with pytest.raises(ValueError, match="takes up to"):

@@ -119,6 +119,7 @@ def test_bad_input_is_refused(unchecked, change, words):
         tj.solve_rotation(**(dict(src=src, dst=dst, noise_bound=BOUND) | change))
 
 
+@pytest.mark.long
 def test_the_record_is_asked_for_its_turn(monkeypatch):
     """A method that is added turns the rotation by itself, and not by the search over pairs."""
     asked = []

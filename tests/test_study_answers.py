@@ -137,6 +137,7 @@ def test_answers_may_come_in_any_order_and_in_several_files(answers, tmp_path):
         read_answers(parts[:1], study, origin, cells)
 
 
+@pytest.mark.long
 def test_only_what_a_study_measures_must_be_answered(tmp_path):
     for name, part, true in (("scale", "scale", 1.0), ("translation", "translation", 1.0)):
         (path,) = save_trials(tmp_path, draw_trials(studies()[name], runs=2, quick=True), name=name)

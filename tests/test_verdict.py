@@ -74,6 +74,7 @@ def test_a_scale_off_by_less_than_the_bound_is_none_of_that():
         assert found.inliers[drawn.inliers].all()
 
 
+@pytest.mark.long
 def test_a_mirror_image_has_no_pose():
     src = cloud()
     for mirror in (np.diag([1, 1, -1]), np.eye(3)[[0, 2, 1]], 2 * np.diag([-1, 1, 1])):
