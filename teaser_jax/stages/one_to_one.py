@@ -68,7 +68,7 @@ def bound_on_rows(
 
     Args:
         size: No clique that has each point once is larger.
-        further: From ``one_to_one``.
+        further: From ``one_to_one_graph``.
         mask: Rows to use.
     """
     if mask.shape[0] == 0:
@@ -117,8 +117,8 @@ def _with_shared_points(
 ) -> OneToOne:
     edges = consistency_graph(src, dst, noise_bound, mask, scale=scale, cbar2=cbar2, one_to_one=True)
     reach = jnp.where(mask, reach_of(src, dst, noise_bound, mask, scale, cbar2), jnp.nan)
-    here, there = jnp.stack([src, dst]), jnp.stack([dst, scale * src])
-    return OneToOne(edges, jnp.sum(jax.vmap(_further, (0, 0, None))(here, there, reach), axis=0))
+    clouds = jnp.stack([scale * src, dst])  # points are equal here if they are in the graph
+    return OneToOne(edges, jnp.sum(jax.vmap(_further, (0, 0, None))(clouds, clouds[::-1], reach), axis=0))
 
 
 def _further(points: Array, partners: Array, reach: Array) -> Float[Array, " n"]:
