@@ -25,7 +25,7 @@ from teaser_jax.stages.widening import bound_widening
 class Graph(NamedTuple):
     """What is known before the clique: where the rows are, and which; the scale; the bounds; who agrees.
 
-    Matches of one point do not; ``further`` bounds what they may add to a set of others.
+    Where matches crowd at a point, those of one point do not; ``further`` bounds what they may add.
     """
 
     rows: Rows

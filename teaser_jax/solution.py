@@ -108,11 +108,11 @@ class Solution:
         selection: The sets behind the pose.
         inliers: ``selection.inliers``, in the user's order.
         status: A ``Status`` as int32; the first failure sticks.
-        clique_size: Members of the clique, which has each point of the source and of the target once.
+        clique_size: Members of the clique, copies counted once; where matches crowd at a point, it has each
+            point once.
         clique_upper_bound: No pose explains more matches, copies counted once: proved. Equal to the size of
-            a maximum clique unless points are in several matches.
-        clique_is_maximum: Whether it is proved that no clique with each point once is larger; never without
-            pruning.
+            a maximum clique where no matches crowd.
+        clique_is_maximum: Whether it is proved that no clique of that kind is larger; never without pruning.
         excluded: Rows left out because they hold NaN or infinity.
         cost: The joint cost (6) of the pose, with the widened bounds and copies counted once [-].
     """

@@ -9,7 +9,7 @@ import pytest
 from oracles import clique_number, length_gaps, random_rotation, solve, unpack
 
 import teaser_jax as tj
-from teaser_jax.stages.one_to_one import bound_on_rows, one_to_one_graph
+from teaser_jax.stages.one_to_one import CROWD, bound_on_rows, one_to_one_graph
 
 N = 40
 
@@ -24,11 +24,11 @@ BOUND = jax.jit(bound_on_rows)
 
 
 def some_matches(seed: int, repeat: bool):
-    """Matches that agree as often as not, on points of which some repeat or none; some are masked."""
+    """Matches that agree as often as not, on points of which some are in many matches, or none is."""
     rng = np.random.default_rng(seed)
     src, dst = rng.normal(size=(2, N, 3))
     if repeat:
-        src, dst = src[rng.integers(0, 12, N)], dst[rng.integers(0, 25, N)]
+        src, dst = src[rng.integers(0, 3, N)], dst[rng.integers(0, 25, N)]
         src[:2], dst[2:4] = [[0.0, 0, 0], [-0.0, 0, 0]], 1.0  # zeros of both signs are one point
     bounds = rng.uniform(0.1, 1.5, N)
     return src.astype(np.float32), dst.astype(np.float32), bounds.astype(np.float32), rng.random(N) < 0.9
@@ -39,9 +39,8 @@ def all_edges(src, dst, bounds, mask) -> np.ndarray:
     return (length_gaps(src, dst) <= bounds[:, None] + bounds) & off
 
 
-def without_shared(dense, src, dst) -> np.ndarray:
-    alike = [(points[:, None] == points).all(axis=2) for points in (src, dst)]
-    return dense & ~alike[0] & ~alike[1]
+def shared_points(src, dst) -> list[np.ndarray]:
+    return [(points[:, None] == points).all(axis=2) for points in (src, dst)]
 
 
 @pytest.mark.parametrize("repeat", [True, False])
@@ -50,8 +49,9 @@ def test_edges_between_matches_of_one_point_go_and_the_bound_stays_one(seed, rep
     src, dst, bounds, mask = some_matches(seed, repeat)
     found = ONE(src, dst, bounds, mask)
     dense = all_edges(src, dst, bounds, mask)
-    wanted = without_shared(dense, src, dst)
-    assert (wanted.sum() < dense.sum()) == repeat
+    of_src, of_dst = shared_points(src, dst)
+    assert (np.sum(dense & of_src, axis=1).max() >= CROWD) == repeat
+    wanted = dense & ~of_src & ~of_dst
     np.testing.assert_array_equal(unpack(found.edge_bits, N), wanted)
     apart, together = clique_number(wanted), clique_number(dense)
     bound = int(BOUND(np.int32(apart), found.further, mask))
@@ -62,14 +62,23 @@ def test_edges_between_matches_of_one_point_go_and_the_bound_stays_one(seed, rep
         assert bound == apart
 
 
-def test_what_a_point_may_add_is_what_agrees_with_one_of_its_matches():
-    """Three matches of one source and two of one target, of which one is too far off to agree."""
+@pytest.mark.parametrize("crowd", [CROWD - 1, CROWD])
+def test_a_few_matches_of_one_point_stay_as_they_are(crowd):
+    """One source in ``crowd`` + 2 matches, of which one is too far off to agree; one target in two."""
     rng = np.random.default_rng(0)
-    src, dst = rng.normal(size=(2, 8, 3)).astype(np.float32)
-    src[:3], dst[6:] = src[0], dst[7]
-    dst[1], dst[2], src[6] = dst[0] + 0.01, dst[0] + 5, src[7] + 0.01
-    found = ONE(src, dst, np.full(8, 0.05, np.float32), np.ones(8, bool))
-    np.testing.assert_array_equal(found.further, [2, 2, 2, 2, 2, 2, 2, 2])
+    src, dst = rng.normal(size=(2, N, 3)).astype(np.float32)
+    src[: crowd + 2], dst[: crowd + 1] = src[0], dst[0] + rng.uniform(0, 0.01, (crowd + 1, 3))
+    dst[crowd + 1] = dst[0] + 5
+    dst[-2], src[-2] = dst[-1], src[-1] + 0.01
+    bounds, mask = np.full(N, 0.05, np.float32), np.ones(N, bool)
+    found = ONE(src, dst, bounds, mask)
+    dense = all_edges(src, dst, bounds, mask)
+    if crowd < CROWD:
+        np.testing.assert_array_equal(unpack(found.edge_bits, N), dense)
+        assert not np.any(found.further)
+    else:
+        assert not unpack(found.edge_bits, N)[: crowd + 1, : crowd + 1].any()
+        np.testing.assert_array_equal(found.further, np.full(N, crowd + 1))
 
 
 def test_a_batch_is_thinned_as_its_problems_are():

@@ -84,7 +84,7 @@ def consistency_graph(
     scale: Float[Array, ""],
     cbar2: Float[Array, ""],
     pairs: Int[Array, "m 2"] | None = None,
-    one_to_one: bool = False,
+    one_to_one: bool | Bool[Array, ""] = False,
 ) -> UInt32[Array, "n w"]:
     """Find edges between matches with | |b_ij| - s |a_ij| | <= c (beta_i + beta_j), as packed bit rows.
 
@@ -107,8 +107,8 @@ def consistency_graph(
             edge = lengths_agree(
                 squared_norm(visited.src_tims), squared_norm(visited.dst_tims), visited.bounds
             )
-            if one_to_one:
-                edge &= ~(are_zero(visited.src_tims) | are_zero(visited.dst_tims))
+            if one_to_one is not False:
+                edge &= ~(one_to_one & (are_zero(visited.src_tims) | are_zero(visited.dst_tims)))
             return bits.with_lane(rows, lane, edge)
 
         # Masked matches reach NaN far, which spares a test in each of n^2 pairs.
