@@ -63,7 +63,7 @@ def one_to_one_graph(
     References: section VI-D for the graph.
     """
     inputs = lax.stop_gradient((src, dst, noise_bound, mask, scale, cbar2))
-    return _of_few(*inputs) if mask.shape[0] == 0 else OneToOne(*_graph(*inputs))
+    return _whole(*inputs) if mask.shape[0] == 0 else OneToOne(*_graph(*inputs))
 
 
 def bound_on_rows(
@@ -86,7 +86,7 @@ def bound_on_rows(
 
 @custom_vmap
 def _graph(*inputs: Any) -> OneToOne:
-    return lax.cond(_has_crowded_points(*inputs[:4]), _of_many, _of_few, *inputs)
+    return lax.cond(_has_crowded_points(*inputs[:4]), _thinned_where_crowded, _whole, *inputs)
 
 
 @_graph.def_vmap
@@ -99,7 +99,7 @@ def _graphs(size: int, batched: Any, *inputs: Any) -> tuple[OneToOne, OneToOne]:
     # This may be traced after the block that allowed float64 has ended: its numbers must stay what they are.
     with jax.enable_x64(True) if inputs[0].dtype == jnp.float64 else nullcontext():
         some = jnp.any(jax.vmap(_has_crowded_points)(*each[:4]))
-        found = lax.cond(some, jax.vmap(_of_many), jax.vmap(_of_few), *each)
+        found = lax.cond(some, jax.vmap(_thinned_where_crowded), jax.vmap(_whole), *each)
     return found, OneToOne(True, True)  # type: ignore[arg-type]  # which of them have the axis
 
 
@@ -110,12 +110,14 @@ def _has_crowded_points(src: Array, dst: Array, noise_bound: Array, mask: Array)
     return jnp.any((key[:, CROWD:] == key[:, :-CROWD]) & (key[:, CROWD:] != unusable))
 
 
-def _of_few(src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array) -> OneToOne:
+def _whole(src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array) -> OneToOne:
     edges = consistency_graph(src, dst, noise_bound, mask, scale=scale, cbar2=cbar2)
     return OneToOne(edges, jnp.zeros(mask.shape, jnp.float32))
 
 
-def _of_many(src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array) -> OneToOne:
+def _thinned_where_crowded(
+    src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
+) -> OneToOne:
     reach = jnp.where(mask, reach_of(src, dst, noise_bound, mask, scale, cbar2), jnp.nan)
     clouds = jnp.stack([scale * src, dst])  # points are equal here if they are in the graph
     most = jax.vmap(_company, (0, 0, None))(clouds, clouds[::-1], reach)
