@@ -86,24 +86,25 @@ def bound_on_rows(
 
 @custom_vmap
 def _graph(*inputs: Any) -> OneToOne:
-    return lax.cond(_has_crowded_points(*inputs[:4]), _thinned_where_crowded, _whole, *inputs)
+    src, dst, _, mask, *_ = inputs
+    return lax.cond(_has_crowded_points(src, dst, mask), _thinned_where_crowded, _whole, *inputs)
 
 
 @_graph.def_vmap
 def _graphs(size: int, batched: Any, *inputs: Any) -> tuple[OneToOne, OneToOne]:
     # One question for the whole batch: under a plain vmap all would pay for both answers.
-    each = [
+    src, dst, _, mask, *_ = each = [
         x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
         for x, has_axis in zip(inputs, batched, strict=True)
     ]
     # This may be traced after the block that allowed float64 has ended: its numbers must stay what they are.
     with jax.enable_x64(True) if inputs[0].dtype == jnp.float64 else nullcontext():
-        some = jnp.any(jax.vmap(_has_crowded_points)(*each[:4]))
+        some = jnp.any(jax.vmap(_has_crowded_points)(src, dst, mask))
         found = lax.cond(some, jax.vmap(_thinned_where_crowded), jax.vmap(_whole), *each)
     return found, OneToOne(True, True)  # type: ignore[arg-type]  # which of them have the axis
 
 
-def _has_crowded_points(src: Array, dst: Array, noise_bound: Array, mask: Array) -> Bool[Array, ""]:
+def _has_crowded_points(src: Array, dst: Array, mask: Array) -> Bool[Array, ""]:
     """Tell whether more than ``CROWD`` usable matches may have one point: never no where they have."""
     unusable = jnp.uint32(0xFFFFFFFF)
     key = jax.vmap(lambda points: jnp.sort(jnp.where(mask, keys(points.T), unusable)))(jnp.stack([src, dst]))
