@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, UInt32
 
@@ -38,13 +39,27 @@ class Graph(NamedTuple):
 
 
 def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
-    """Find the scale and the consistency graph of a clean problem; edges are tested in ``edge_dtype``."""
+    """Find the scale and the consistency graph of a clean problem.
+
+    Args:
+        p: Clean.
+        settings: How to solve.
+        edge_dtype: The type in which edges are tested; None: that of the problem.
+        run: Runs each stage.
+    """
     rows = run("rows", arrange, p)
-    p = in_rows(p, rows)
-    scale, scale_pairs = run("scale", find_scale, p, settings)
-    widening = run("widening", find_widening, p, scale, settings, dtype=edge_dtype)
-    edges = run("consistency graph", find_edges, widened(p, widening), scale, dtype=edge_dtype)
-    return Graph(rows, p.mask, scale, scale_pairs, widening, *edges)
+    near = in_rows(p if edge_dtype is None else in_precision(p, edge_dtype), rows)
+    scale, scale_pairs = run("scale", find_scale, near, settings)
+    widening = run("widening", find_widening, near, scale, settings)
+    edges = run("consistency graph", find_edges, widened(near, widening), scale)
+    dtype = p.src.dtype
+    exact = scale.astype(dtype) if p.scale is None else p.scale
+    return Graph(rows, near.mask, exact, scale_pairs, widening.astype(dtype), *edges)
+
+
+def in_precision(p: Problem, dtype: Any) -> Problem:
+    """Give all numbers of a problem a type."""
+    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, p)
 
 
 def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScalePairs | None]:
@@ -57,26 +72,20 @@ def find_scale(p: Problem, settings: Settings) -> tuple[Float[Array, ""], ScaleP
     )  # fmt: skip
 
 
-def find_widening(
-    p: Problem, scale: Float[Array, ""], settings: Settings, *, dtype: Any = None
-) -> Float[Array, ""]:
+def find_widening(p: Problem, scale: Float[Array, ""], settings: Settings) -> Float[Array, ""]:
     """Find by how much bounds are wider than asked for; the plain cascade takes them as they are."""
     if settings.refine is None:
         return jnp.ones_like(p.cbar2)
-    src, dst, noise_bound, scale, cbar2 = _as(dtype, p.src, p.dst, p.noise_bound, scale, p.cbar2)
-    wide = bound_widening(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
-    return wide.astype(p.src.dtype)
+    return bound_widening(
+        p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs
+    )  # fmt: skip
 
 
-def find_edges(p: Problem, scale: Float[Array, ""], *, dtype: Any = None) -> OneToOne:
-    """Find who agrees with whom at a scale, tested in ``dtype`` (None: that of the problem)."""
-    src, dst, noise_bound, scale, cbar2 = _as(dtype, p.src, p.dst, p.noise_bound, scale, p.cbar2)
+def find_edges(p: Problem, scale: Float[Array, ""]) -> OneToOne:
+    """Find who agrees with whom at a scale."""
     if p.pairs is None:
-        return one_to_one_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2)
-    edges = consistency_graph(src, dst, noise_bound, p.mask, scale=scale, cbar2=cbar2, pairs=p.pairs)
+        return one_to_one_graph(p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2)
+    edges = consistency_graph(
+        p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, pairs=p.pairs
+    )  # fmt: skip
     return OneToOne(edges, jnp.zeros(p.mask.shape, jnp.float32))  # pairs that nobody names exclude nothing
-
-
-def _as(dtype: Any, *arrays: Array) -> list[Array]:
-    """Give arrays a type; None: that of the first."""
-    return [x.astype(dtype or arrays[0].dtype) for x in arrays]

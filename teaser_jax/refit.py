@@ -20,7 +20,7 @@ from teaser_jax.problem import Problem, clean
 from teaser_jax.rows import in_rows
 from teaser_jax.solution import Selection
 from teaser_jax.stages.pairs import ring_pairs, tim_bounds, tims
-from teaser_jax.stages.refinement import fit_similarity
+from teaser_jax.stages.refinement import Fit, fit_similarity
 from teaser_jax.stages.rotation.tims import Chosen, correlation, correlation_of_pairs
 from teaser_jax.stages.scale import scale_of_pairs
 from teaser_jax.stages.translation import translation_of_points
@@ -68,7 +68,7 @@ def refit(problem: Problem, selection: Selection) -> Pose:
 def _refit(problem: Problem, selection: Selection) -> Pose:
     """Compute the pose; problem and selection belong together."""
     p, chosen = as_solved(clean(problem)[0], jax.tree.map(jnp.asarray, selection))
-    return lax.cond(chosen.refined, lambda: joint_pose(p, chosen), lambda: cascade_pose(p, chosen))
+    return lax.cond(chosen.refined, lambda: joint_fit(p, chosen).pose, lambda: cascade_pose(p, chosen))
 
 
 _compiled = jax.jit(_refit)
@@ -124,11 +124,14 @@ def check_problem(problem: Any) -> None:
         )
 
 
-def joint_pose(p: Problem, selection: Selection) -> Pose:
-    """Compute the weighted similarity fit to the inliers of a refined selection; the problem is clean."""
+def joint_fit(p: Problem, selection: Selection) -> Fit:
+    """Compute the weighted similarity fit to the inliers: the pose of a refined selection.
+
+    The problem is clean.
+    """
     weights = jnp.where(selection.inliers, p.confidence / p.noise_bound**2, 0)
     fit = fit_similarity(p.src, p.dst, weights, p.scale)
-    return _constant_if_ambiguous(fit.pose, fit.correlation)
+    return fit._replace(pose=_constant_if_ambiguous(fit.pose, fit.correlation))
 
 
 def cascade_pose(p: Problem, selection: Selection) -> Pose:
@@ -159,7 +162,7 @@ def chosen_pairs(p: Problem, members: Bool[Array, " n"]) -> Int[Array, "k 2"]:
 
 def _constant_if_ambiguous(pose: Pose, correlation: Float[Array, "3 3"]) -> Pose:
     """Stop the derivative of a pose whose rotation could as well be another: there it means nothing."""
-    ambiguous = so3.is_ambiguous(correlation)
+    ambiguous = so3.is_ambiguous(correlation, pose.rotation)
     return jax.tree.map(lambda x: jnp.where(ambiguous, lax.stop_gradient(x), x), pose)
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32, UInt64
 
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray, Placeholder, namespace
+from teaser_jax.ground.branches import if_any
 from teaser_jax.problem import Problem
 
 # Odd numbers, one for each coordinate of a match and one for their sum, that mix bits.
@@ -60,31 +61,45 @@ def arrange(problem: Problem) -> Rows:
         both = lax.sort((key << width) | index.astype(jnp.uint64))
         key, order = both >> width, (both & ((np.uint64(1) << width) - np.uint64(1))).astype(jnp.int32)
         usable = key != _LAST >> width
-    alike = (key[1:] == key[:-1]) & usable[1:]
+    alike = jnp.pad((key[1:] == key[:-1]) & usable[1:], (1, 0))
+    return _arranged(order, usable, alike, points, p.confidence, p.noise_bound)
 
-    def without_copies() -> Rows:  # nearly always
-        mixed = order[_shuffled(index, jnp.sum(usable, dtype=jnp.int32))]
-        return Rows(mixed, jnp.zeros_like(index).at[mixed].set(index))
 
-    def with_copies() -> Rows:
-        here = points[:, order]
-        copy = jnp.pad(alike & jnp.all(here[:, 1:] == here[:, :-1], axis=0), (1, 0))
-        leads = usable & ~copy
-        count = jnp.sum(leads, dtype=jnp.int32)
-        shuffled = _shuffled(index, count)
-        back = jnp.zeros_like(index).at[shuffled].set(index)
-        place = jnp.zeros_like(index).at[order].set(jnp.where(usable, back[bits.rank(leads) - 1], index))
-        # Of copies the most confident one stands for all, and of those one with the smallest bound.
-        best = jnp.zeros_like(p.confidence).at[place].max(p.confidence)
-        doubt = jnp.where(p.confidence == best[place], p.noise_bound, jnp.inf)
-        least = jnp.full_like(doubt, jnp.inf).at[place].min(doubt)
-        winner = jnp.full(n, n - 1, jnp.int32).at[place].min(jnp.where(doubt == least[place], index, n - 1))
-        # Then the copies, which nobody will look at.
-        last = jnp.where(copy, count + bits.rank(copy) - 1, index)
-        rest = order.at[jnp.where(leads, n, last)].set(order, mode="drop")
-        return Rows(jnp.where(index < count, winner, rest), place)
+def _without_copies(order: Array, usable: Array, *_: Array) -> Rows:
+    """Shuffle rows of which no two can be copies: nearly always."""
+    index = jnp.arange(order.shape[0], dtype=jnp.int32)
+    mixed = order[_shuffled(index, jnp.sum(usable, dtype=jnp.int32))]
+    return Rows(mixed, jnp.zeros_like(index).at[mixed].set(index))
 
-    return lax.cond(jnp.any(alike), with_copies, without_copies)
+
+def _with_copies(
+    order: Array, usable: Array, alike: Array, points: Array, confidence: Array, noise_bound: Array
+) -> Rows:
+    """Shuffle rows of which some may be copies; these go to the end, where nobody will look at them."""
+    n = order.shape[0]
+    index = jnp.arange(n, dtype=jnp.int32)
+    here = points[:, order]
+    copy = alike & jnp.pad(jnp.all(here[:, 1:] == here[:, :-1], axis=0), (1, 0))
+    leads = usable & ~copy
+    count = jnp.sum(leads, dtype=jnp.int32)
+    shuffled = _shuffled(index, count)
+    back = jnp.zeros_like(index).at[shuffled].set(index)
+    place = jnp.zeros_like(index).at[order].set(jnp.where(usable, back[bits.rank(leads) - 1], index))
+    # Of copies the most confident one stands for all, and of those one with the smallest bound.
+    best = jnp.zeros_like(confidence).at[place].max(confidence)
+    doubt = jnp.where(confidence == best[place], noise_bound, jnp.inf)
+    least = jnp.full_like(doubt, jnp.inf).at[place].min(doubt)
+    winner = jnp.full(n, n - 1, jnp.int32).at[place].min(jnp.where(doubt == least[place], index, n - 1))
+    last = jnp.where(copy, count + bits.rank(copy) - 1, index)
+    rest = order.at[jnp.where(leads, n, last)].set(order, mode="drop")
+    return Rows(jnp.where(index < count, winner, rest), place)
+
+
+def _may_have_copies(order: Array, usable: Array, alike: Array, *_: Array) -> Bool[Array, ""]:
+    return jnp.any(alike)
+
+
+_arranged = if_any(_may_have_copies, _with_copies, _without_copies)
 
 
 def _shuffled(index: Int[Array, " n"], count: Int[Array, ""]) -> Int[Array, " n"]:
@@ -130,15 +145,12 @@ def in_rows(problem: Problem, rows: Rows) -> Problem:
     """
     order, place = rows.order, rows.place
     alone = place[order] == jnp.arange(order.shape[0], dtype=order.dtype)
-    # In one piece: to gather a row of numbers takes as long as to gather one.
-    parts = (problem.src, problem.dst, problem.noise_bound[:, None], problem.confidence[:, None])
-    here = jnp.concatenate(parts, axis=1)[order]
     return replace(
         problem,
-        src=here[:, 0:3],
-        dst=here[:, 3:6],
-        noise_bound=here[:, 6],
+        src=problem.src[order],
+        dst=problem.dst[order],
+        noise_bound=problem.noise_bound[order],
         mask=problem.mask[order] & alone,
-        confidence=here[:, 7],
+        confidence=problem.confidence[order],
         pairs=None if problem.pairs is None else place[problem.pairs],
     )

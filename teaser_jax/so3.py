@@ -218,10 +218,14 @@ def _inverse(
     return jnp.where(ambiguous, 0, adjugate / jnp.where(ambiguous, 1, determinant)) / size, ambiguous
 
 
-def is_ambiguous(matrix: Float[Array, "3 3"]) -> Bool[Array, ""]:
-    """Tell whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirroring."""
-    matrix = lax.stop_gradient(matrix)
-    return _inverse(matrix, nearest_rotation(matrix))[1]
+def is_ambiguous(matrix: Float[Array, "3 3"], rotation: Float[Array, "3 3"]) -> Bool[Array, ""]:
+    """Tell whether more than one rotation maximises tr(R^T H), to rounding: points on a line, a mirroring.
+
+    Args:
+        matrix: H.
+        rotation: Its nearest rotation.
+    """
+    return _inverse(*lax.stop_gradient((matrix, rotation)))[1]
 
 
 def rotation_angle(rotation: Float[AnyArray, "... 3 3"]) -> Float[AnyArray, "..."]:

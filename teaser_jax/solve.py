@@ -25,14 +25,14 @@ from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.steps import Run, plainly
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, check_precision, clean
-from teaser_jax.refit import cascade_pose, check_problem, joint_pose, widened
+from teaser_jax.refit import cascade_pose, check_problem, joint_fit, widened
 from teaser_jax.rows import in_rows
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Selection, Solution, as_asked, with_rows
 from teaser_jax.stages.clique.clique import Clique
 from teaser_jax.stages.clique.maximum import maximum_clique
 from teaser_jax.stages.one_to_one import bound_on_rows
-from teaser_jax.stages.refinement import Refinement, refine, squared_residuals, truncated_cost
+from teaser_jax.stages.refinement import Fit, Refinement, refine, squared_residuals, truncated_cost
 from teaser_jax.stages.verdict import evidence_of, status_of
 
 
@@ -135,9 +135,13 @@ def conclude(
     p = widened(in_rows(p, graph.rows), graph.widening)
     frozen, graph, clique = lax.stop_gradient((p, graph, clique))
     selection, settled = choose(frozen, graph, clique, settings, cascade=cascade, run=run)
-    pose = run("refit", joint_pose if settings.refine else cascade_pose, p, selection)
-    found = lax.stop_gradient(pose)
-    status = run("verdict", judge, frozen, found, selection, graph.edge_bits, settled, settings, offset)
+    if settings.refine:
+        fit = run("refit", joint_fit, p, selection)
+        pose = fit.pose
+    else:
+        fit, pose = joint_fit(frozen, selection), run("refit", cascade_pose, p, selection)
+    found = lax.stop_gradient((pose, fit))
+    status = run("verdict", judge, frozen, *found, selection, graph.edge_bits, settled, settings, offset)
     size = jnp.sum(clique.members, dtype=jnp.int32)
     solution = Solution(
         pose=pose,
@@ -154,12 +158,12 @@ def conclude(
 
 
 def judge(
-    p: Problem, pose: Pose, selection: Selection, edge_bits: UInt32[Array, "n w"], settled: Bool[Array, ""],
-    settings: Settings, offset: Float[AnyArray, "3"] | None,
+    p: Problem, pose: Pose, fit: Fit, selection: Selection, edge_bits: UInt32[Array, "n w"],
+    settled: Bool[Array, ""], settings: Settings, offset: Float[AnyArray, "3"] | None,
 ) -> Int[Array, ""]:  # fmt: skip
     """Decide the status of a pose, from what speaks for it and against it."""
     evidence = evidence_of(
-        p, pose, selection.inliers, selection.clique, edge_bits,
+        p, pose, fit, selection.inliers, selection.clique, edge_bits,
         has_settled=settled, pruned=settings.clique.prunes, scale_range=settings.scale_search.range,
         offset=offset,
     )  # fmt: skip

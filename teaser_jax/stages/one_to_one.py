@@ -7,17 +7,16 @@ either cloud once. What follows it, the refinement and the verdict, sees all mat
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.ground.branches import if_any
 from teaser_jax.rows import keys
 from teaser_jax.stages.consistency import consistency_graph, reach_of
 
@@ -63,7 +62,7 @@ def one_to_one_graph(
     References: section VI-D for the graph.
     """
     inputs = lax.stop_gradient((src, dst, noise_bound, mask, scale, cbar2))
-    return _whole(*inputs) if mask.shape[0] == 0 else OneToOne(*_graph(*inputs))
+    return _whole(*inputs) if mask.shape[0] == 0 else _graph(*inputs)
 
 
 def bound_on_rows(
@@ -84,31 +83,20 @@ def bound_on_rows(
     return jnp.minimum(size + jnp.minimum(more, usable.astype(more.dtype)).astype(jnp.int32), usable)
 
 
-@custom_vmap
-def _graph(*inputs: Any) -> OneToOne:
-    src, dst, _, mask, *_ = inputs
-    return lax.cond(_has_crowded_points(src, dst, mask), _thinned_where_crowded, _whole, *inputs)
+def _has_crowded_points(
+    src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array
+) -> Bool[Array, ""]:
+    """Tell whether more than ``CROWD`` usable matches may have one point: never no where they have.
 
+    Points are counted in slots, by a hash of their coordinates.
+    """
+    width = (8 * mask.shape[0]).bit_length()  # so sparse that hardly any slot holds seven different points
 
-@_graph.def_vmap
-def _graphs(size: int, batched: Any, *inputs: Any) -> tuple[OneToOne, OneToOne]:
-    # One question for the whole batch: under a plain vmap all would pay for both answers.
-    src, dst, _, mask, *_ = each = [
-        x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
-        for x, has_axis in zip(inputs, batched, strict=True)
-    ]
-    # This may be traced after the block that allowed float64 has ended: its numbers must stay what they are.
-    with jax.enable_x64(True) if inputs[0].dtype == jnp.float64 else nullcontext():
-        some = jnp.any(jax.vmap(_has_crowded_points)(src, dst, mask))
-        found = lax.cond(some, jax.vmap(_thinned_where_crowded), jax.vmap(_whole), *each)
-    return found, OneToOne(True, True)  # type: ignore[arg-type]  # which of them have the axis
+    def fullest(points: Array) -> Array:
+        slot = (keys(points.T) >> (31 - width)).astype(jnp.int32)
+        return jnp.max(jnp.zeros(1 << width, jnp.int32).at[slot].add(mask.astype(jnp.int32)))
 
-
-def _has_crowded_points(src: Array, dst: Array, mask: Array) -> Bool[Array, ""]:
-    """Tell whether more than ``CROWD`` usable matches may have one point: never no where they have."""
-    unusable = jnp.uint32(0xFFFFFFFF)
-    key = jax.vmap(lambda points: jnp.sort(jnp.where(mask, keys(points.T), unusable)))(jnp.stack([src, dst]))
-    return jnp.any((key[:, CROWD:] == key[:, :-CROWD]) & (key[:, CROWD:] != unusable))
+    return jnp.maximum(fullest(src), fullest(dst)) > CROWD
 
 
 def _whole(src: Array, dst: Array, noise_bound: Array, mask: Array, scale: Array, cbar2: Array) -> OneToOne:
@@ -160,3 +148,6 @@ def _company(points: Array, partners: Array, reach: Array) -> Int[Array, " n"]:
     counts = lax.while_loop(lambda state: state[2] & (state[0] < n), compare, start)[1]
     most = jnp.zeros(n, jnp.int32).at[point].max(counts)
     return -jnp.sort(-most)
+
+
+_graph = if_any(_has_crowded_points, _thinned_where_crowded, _whole)

@@ -50,6 +50,7 @@ class Fit(NamedTuple):
     pose: Pose
     correlation: Float[Array, "3 3"]  # sum w (b - mean b)(a - mean a)^T
     src_mean: Float[Array, "3"]
+    own_scale: Float[Array, ""]  # the scale that suits it best, whatever is known
 
 
 @jax.jit
@@ -80,13 +81,14 @@ def fit_similarity(
     # Rounding would turn the fit of one or two points at random.
     h = jnp.where(count > 2.5, correlation(weights, a, b), 0)
     rotation = so3.nearest_rotation(h)
+    below = jnp.sum(weights[:, None] * a * a)
+    some = below > 0
+    own_scale = jnp.sum(rotation * h) / jnp.where(some, below, 1)
+    own_scale = jnp.where(some & (own_scale > 0), own_scale, 1)
     if scale is None:
-        below = jnp.sum(weights[:, None] * a * a)
-        some = below > 0
-        scale = jnp.sum(rotation * h) / jnp.where(some, below, 1)
-        scale = jnp.where(some & (scale > 0), scale, 1)
+        scale = own_scale
     translation = dst_mean - scale * jnp.sum(rotation * src_mean[None], axis=1)
-    return Fit(Pose(rotation, translation, scale), h, src_mean)
+    return Fit(Pose(rotation, translation, scale), h, src_mean, own_scale)
 
 
 @jax.jit

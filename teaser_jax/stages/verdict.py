@@ -87,6 +87,7 @@ class Evidence(NamedTuple):
 def evidence_of(
     problem: Problem,
     pose: Pose,
+    fit: Fit,
     inliers: Bool[Array, " n"],
     clique: Bool[Array, " n"],
     edge_bits: UInt32[Array, "n w"],
@@ -101,6 +102,7 @@ def evidence_of(
     Args:
         problem: Clean.
         pose: The candidate, from the source to the target frame.
+        fit: The fit to its inliers, at the known scale where there is one.
         inliers: The matches that it explains.
         clique: The clique it came from.
         edge_bits: The consistency graph.
@@ -120,7 +122,6 @@ def evidence_of(
     by_reflection = explained_by_reflection(problem, clique)
     by_pose = jnp.sum(clique & inliers, dtype=jnp.int32)
     r2 = squared_residuals(pose, problem.src, problem.dst, problem.noise_bound)
-    fit = free_fit(problem, inliers)
     low, high = scale_range
     outside = (pose.scale < (1 - SCALE_SLACK) * low) | (pose.scale > (1 + SCALE_SLACK) * high)
     return Evidence(
@@ -133,8 +134,8 @@ def evidence_of(
         has_collapsed=agreeing.astype(dtype) < fewest if pruned else no,
         is_mirrored=by_reflection.astype(dtype) > MOST_SHARE_OF_MIRROR * by_pose.astype(dtype),
         by_reflection=by_reflection,
-        by_fit=count_explained(problem, at_scale(fit, problem.scale)),
-        by_other_scale=count_explained(problem, fit.pose),
+        by_fit=count_explained(problem, fit.pose),
+        by_other_scale=count_explained(problem, at_own_scale(fit)),
         has_left_range=outside if problem.scale is None else no,
         has_settled=has_settled,
         is_by_position=matched_by_position(
@@ -191,21 +192,13 @@ def count_distinct(points: Float[Array, "n 3"], chosen: Bool[Array, " n"]) -> In
     return jnp.sum(taken, dtype=jnp.int32)
 
 
-def free_fit(problem: Problem, inliers: Bool[Array, " n"]) -> Fit:
-    """Fit the inliers at the scale that suits them best, whatever is known.
+def at_own_scale(fit: Fit) -> Pose:
+    """Give the pose of a fit at the scale that suits it: rotation and mean of the points stay.
 
     Where the known scale is wrong, matches that lie close together agree within their bounds all the same and
     tell the right one.
     """
-    weights = jnp.where(inliers, problem.confidence / problem.noise_bound**2, 0)
-    return fit_similarity(problem.src, problem.dst, weights)
-
-
-def at_scale(fit: Fit, scale: Float[Array, ""] | None) -> Pose:
-    """Give the pose of a fit at another scale: the rotation stays, and so does the mean of the points."""
-    if scale is None:
-        return fit.pose
-    rotation, translation = fit.pose.rotation, fit.pose.translation
+    rotation, translation, scale = fit.pose.rotation, fit.pose.translation, fit.own_scale
     moved = (fit.pose.scale - scale) * jnp.sum(rotation * fit.src_mean[None], axis=1)
     return Pose(rotation, translation + moved, scale)
 
