@@ -24,7 +24,8 @@ class Status(NamedNumber):
     TOO_FEW_POINTS = 1
     NO_CONSENSUS = 2
     DEGENERATE = 3
-    NOT_CONVERGED = 5  # 4 is kept for answers that have a rival
+    AMBIGUOUS = 4
+    NOT_CONVERGED = 5
     MIRRORED = 6
     BY_POSITION = 7
 
@@ -50,6 +51,10 @@ _ADVICE = {
         "The inliers lie on a point or a line compared with noise_bound, so they do not determine the "
         "rotation or the scale: give a smaller noise_bound if it is too large for the unit of the points, or "
         "add matches away from that line."
+    ),
+    Status.AMBIGUOUS: (
+        "Another pose explains the input as well, so no one can tell which of them is right: look at both, "
+        "or give what tells them apart, as a larger part of the scene."
     ),
     Status.MIRRORED: (
         "The clouds are mirror images: the matches agree pairwise, and a reflection explains them where no "

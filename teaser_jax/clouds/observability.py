@@ -1,0 +1,65 @@
+"""Which motions the geometry of an overlap can tell, and which slide or turn freely.
+
+A plane holds three of six motions, a corridor five, a sphere three. What a motion costs is measured by the
+normals that it crosses, in units of how far it displaces the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from teaser_jax.clouds.pairing import Pairing
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """Six motions of an overlap about its centroid, the least visible first.
+
+    Attributes:
+        visible: Which share of each motion (as squared displacement of the points) the normals see [-]:
+            one third where they point evenly everywhere, 0 where it slides freely.
+        motions: A column for each: three numbers of a shift, in shares of a unit displacement, and three
+            of a turn about an axis through the centroid [rad a length].
+        centroid: Of the overlap, in the target frame [length].
+    """
+
+    visible: Float[np.ndarray, "6"]
+    motions: Float[np.ndarray, "6 6"]
+    centroid: Float[np.ndarray, "3"]
+
+    def displacement(self, residual: float) -> float:
+        """Compute how far points of the overlap may be off where surfaces lie ``residual`` apart [length]."""
+        return float(residual * np.sqrt(np.mean(1 / np.maximum(self.visible, 1e-9))))
+
+
+def observability(pairing: Pairing) -> Observability:
+    """Find which motions of the fitting cells their normals see.
+
+    The normals of both surfaces enter, one on each side: their errors are independent, so that noise does
+    not make a plane look held. Where nothing fits, nothing is seen.
+    """
+    chosen = pairing.fits & (pairing.weight > 0)
+    weight = pairing.weight[chosen]
+    if len(weight) < 6:
+        return Observability(np.zeros(6), np.eye(6), np.zeros(3))
+    points, ours, theirs = (x[chosen] for x in (pairing.points, pairing.normals, pairing.partner_normals))
+    weight = weight / weight.sum()
+    centroid = weight @ points
+    arm = points - centroid
+    size = np.sqrt(np.sum(weight @ arm**2))  # turns are measured by it, or units would decide
+    arm = arm / size
+    a, b = (np.hstack([n, np.cross(arm, n)]) for n in (ours, theirs))
+    seen = (weight[:, None] * a).T @ b
+    spread = (weight[:, None] * arm).T @ arm
+    moved = np.eye(6)
+    moved[3:, 3:] = np.trace(spread) * np.eye(3) - spread + 1e-12 * np.eye(3)
+    # seen x = visible moved x, by the square root of what is moved.
+    values, axes = np.linalg.eigh(moved)
+    root = axes / np.sqrt(values) @ axes.T
+    visible, motions = np.linalg.eigh(root @ ((seen + seen.T) / 2) @ root)
+    motions = root @ motions
+    motions[3:] /= size
+    return Observability(np.maximum(visible, 0), motions, centroid)

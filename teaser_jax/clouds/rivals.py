@@ -1,0 +1,112 @@
+"""Other poses in which an overlap fits as well: what has one is ambiguous, whatever it looks like.
+
+They come from motions of the overlap itself and from other candidates. All are asked about a few cells, the
+best about more, and the very best are aligned and compared with the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from teaser_jax.clouds.alternatives import alternatives
+from teaser_jax.clouds.fine import align
+from teaser_jax.clouds.lead import Lead, lead
+from teaser_jax.clouds.observability import Observability
+from teaser_jax.clouds.pairing import Pairing, both_ways, moved, pair, shares
+from teaser_jax.clouds.surface import Surface
+
+DIFFERENT = 2.5  # cells of displacement on average that make another pose
+ASKED, SCREENED, FIRST_LOOK = 400, 200, 50  # cells asked of alternatives: the last, the better, all
+LOOKED_AT_TWICE, TRIED = 60, 6  # alternatives; those that are aligned
+WORTH_A_TRY = 0.3  # of the cells asked
+LIKE = 0.80  # a share of the fitting cells that makes a pose as good
+
+
+class Rivals(NamedTuple):
+    """What other poses explain.
+
+    Attributes:
+        equal: Which part of the fitting cells fits in the other pose that is most like it [-].
+        fit: The fit of that pose [-].
+        lead: How far the pose is ahead of the one that comes nearest.
+        poses: Those in which nearly all of its cells fit.
+    """
+
+    equal: float
+    fit: float
+    lead: Lead
+    poses: tuple[Float[np.ndarray, "4 4"], ...]
+
+
+NONE = Rivals(0.0, 0.0, Lead(1.0, 0.0), ())
+
+
+def find_rivals(
+    pose: Float[np.ndarray, "4 4"],
+    src: Surface,
+    dst: Surface,
+    here: Pairing,
+    seen: Observability,
+    others: Sequence[Float[np.ndarray, "4 4"]] = (),
+) -> Rivals:
+    """Look for other poses in which the fitting cells fit as well.
+
+    Args:
+        pose: From the source to the target frame, as both surfaces stand.
+        src, dst: The surfaces, of one width of cells.
+        here: The source laid onto the target by the pose.
+        seen: Which motions the normals see there.
+        others: Further candidates.
+    """
+    chosen = np.flatnonzero(here.fits & (here.weight > 0))
+    if len(chosen) < 20:
+        return NONE
+    points, cell = here.points[chosen], dst.voxel_size
+    weight = here.weight[chosen] / here.weight[chosen].sum()
+    asked = chosen[np.random.default_rng(0).choice(len(chosen), ASKED, p=weight)]
+    motions = np.concatenate(
+        [
+            alternatives(points, here.normals[chosen], seen, cell),
+            np.reshape([other @ np.linalg.inv(pose) for other in others], (-1, 4, 4)),
+        ]
+    )
+    some = points[:: max(1, len(points) // 500)]
+    apart = lambda motion: np.linalg.norm(moved(motion, some) - some, axis=1).mean()
+    motions = motions[[apart(motion) >= DIFFERENT * cell for motion in motions]]
+    if len(motions) == 0:
+        return NONE
+    quick = _screened(motions @ pose, src, dst, asked)
+    found = Rivals(min(float(quick.max()), WORTH_A_TRY), 0.0, NONE.lead, ())
+    for k in np.argsort(-quick, kind="stable")[:TRIED]:
+        if quick[k] <= WORTH_A_TRY:
+            break
+        other = align(align(motions[k] @ pose, src, dst, reach=4.0), src, dst)
+        if apart(other @ np.linalg.inv(pose)) < DIFFERENT * cell:  # it fell back: judge it where it stood
+            other = motions[k] @ pose
+        share = _share(pair(other, src, dst, asked), ASKED // 2)
+        nearest = min(found.lead, lead(pose, other, src, dst))
+        found = found._replace(lead=nearest, poses=(*found.poses, other) if share > LIKE else found.poses)
+        if share > found.equal or found.fit == 0:
+            found = found._replace(equal=share, fit=min(x.fit for x in both_ways(other, src, dst)))
+    return found
+
+
+def _screened(
+    poses: Float[np.ndarray, "k 4 4"], src: Surface, dst: Surface, asked: Int[np.ndarray, " m"]
+) -> Float[np.ndarray, " k"]:
+    """Tell which part of some cells fits under each pose: of few cells, and of more where these fit best."""
+    quick = shares(poses, src, dst, asked[:FIRST_LOOK])
+    best = np.argsort(-quick, kind="stable")[:LOOKED_AT_TWICE]
+    again = np.zeros_like(quick)
+    again[best] = shares(poses[best], src, dst, asked[:SCREENED])
+    return again
+
+
+def _share(pairing: Pairing, least: int) -> float:
+    """Tell which part of the cells that were asked, and lie in the overlap, fits [-]."""
+    overlap = max(int(np.count_nonzero(pairing.near)), least)
+    return int(np.count_nonzero(pairing.fits)) / overlap

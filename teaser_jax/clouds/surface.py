@@ -1,0 +1,101 @@
+"""A cloud at one width of cells, with all that is asked of it more than once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from teaser_jax.clouds.extra import small_gicp
+from teaser_jax.clouds.fpfh import Descriptors, fpfh
+from teaser_jax.clouds.neighbours import Neighbours, Tree
+from teaser_jax.clouds.normals import across, oriented
+from teaser_jax.clouds.sizes import rows_for
+
+NEIGHBOURS = 120  # of each point, for descriptors, of which those within the radius count
+FEW_NEIGHBOURS = 40  # for normals alone
+NORMAL_RADIUS, FEATURE_RADIUS = 2.5, 5.0  # in cells
+COVARIANCE_NEIGHBOURS = 20
+ROWS_OF_NORMALS = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points of a surface, one a cell.
+
+    Attributes:
+        points: About the middle of their cloud [length].
+        voxel_size: Width of a cell [length].
+        viewpoint: Where the sensor stood; None: unknown.
+        threads: How many threads to ask neighbours with.
+        count: How many neighbours of each point to know: descriptors need all, normals few.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    voxel_size: float
+    viewpoint: Float[np.ndarray, "3"] | None = None
+    threads: int = 1
+    count: int = NEIGHBOURS
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def tree(self) -> Tree:
+        """The points, to ask for the nearest."""
+        return Tree(self.points, self.threads)
+
+    @cached_property
+    def neighbours(self) -> Neighbours:
+        """The nearest points of each."""
+        return self.tree.neighbours(self.points, self.count)
+
+    @cached_property
+    def normals(self) -> Float[np.ndarray, "n 3"]:
+        """Unit normals, zero where the points make no surface."""
+        found = []
+        for start in range(0, len(self), ROWS_OF_NORMALS):
+            rows = slice(start, start + ROWS_OF_NORMALS)
+            near = self.neighbours.squared[rows, :FEW_NEIGHBOURS]
+            there = self.points[self.neighbours.rows[rows, :FEW_NEIGHBOURS]]
+            apart = (there - self.points[rows, None]) / self.voxel_size
+            missing = ROWS_OF_NORMALS - len(near)  # one program for clouds of any size
+            apart = np.pad(apart.astype(np.float32), ((0, missing), (0, 0), (0, 0)))
+            squared = np.pad((near / self.voxel_size**2).astype(np.float32), ((0, missing), (0, 0)))
+            found.append(np.asarray(across(apart, squared, np.float32(NORMAL_RADIUS)))[: len(near)])
+        return oriented(np.concatenate(found).astype(np.float64), self.points, self.viewpoint)
+
+    @cached_property
+    def descriptors(self) -> Descriptors:
+        """What the surroundings of each point look like."""
+        points, neighbours = self._padded
+        rows = np.zeros(points.shape, np.float32)
+        rows[: len(self)] = self.normals
+        orientation = "local" if self.viewpoint is None else "given"
+        found = fpfh(points, rows, neighbours, np.float32(FEATURE_RADIUS), orientation=orientation)
+        return Descriptors(*(x[: len(self)] for x in jax.device_get(found)))
+
+    @cached_property
+    def for_alignment(self) -> Any:
+        """The points as the library of fine registration holds them, with their covariances."""
+        held = small_gicp().PointCloud(self.points)
+        tree = small_gicp().KdTree(held)
+        small_gicp().estimate_normals_covariances(held, tree, COVARIANCE_NEIGHBOURS, self.threads)
+        return held, tree
+
+    @cached_property
+    def _padded(self) -> tuple[Float[Array, "r 3"], Neighbours]:
+        """Points and neighbours in units of a cell, in as many rows as a program is compiled for."""
+        rows = rows_for(len(self))
+        points = np.zeros((rows, 3), np.float32)
+        points[: len(self)] = self.points / self.voxel_size
+        index = np.zeros((rows, self.count), np.int32)
+        squared = np.full((rows, self.count), np.inf, np.float32)
+        index[: len(self)] = self.neighbours.rows
+        squared[: len(self)] = self.neighbours.squared / self.voxel_size**2
+        return jnp.asarray(points), Neighbours(jnp.asarray(index), jnp.asarray(squared))
