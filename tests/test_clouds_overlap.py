@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cloud_scenes import corner, cylinder, plane, sphere, terrain
+from cloud_scenes import CUPBOARD, ROOM, corner, cylinder, on_faces, plane, sphere, terrain
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
 from teaser_jax.clouds.fine import align
+from teaser_jax.clouds.lead import Lead, lead
 from teaser_jax.clouds.observability import observability
 from teaser_jax.clouds.pairing import both_ways, direction_weights, pair
 from teaser_jax.clouds.surface import Surface
@@ -133,3 +134,24 @@ def test_a_method_that_nobody_knows_is_refused():
     src = surface(corner(0), 0.2)
     with pytest.raises(ValueError, match="'gicp', 'plane', 'point'"):
         align(STILL, src, src, method="ndt")
+
+
+def test_what_stands_in_a_room_puts_its_pose_ahead_of_the_other_way_round():
+    room, furnished = ROOM, ROOM + CUPBOARD
+    half = motion([0, 0, np.pi], [0, 0, 0])
+    for built, ahead in ((room, False), (furnished, True)):
+        src, dst = (surface(on_faces(s, 30_000, built), 0.1) for s in (0, 1))
+        forth, back = lead(STILL, half, src, dst), lead(half, STILL, src, dst)
+        assert forth.share == pytest.approx(-back.share, abs=0.02)  # cells have the weights of their pose
+        assert (forth.share > 0.05) == ahead
+        assert (forth.against < 0.3) == ahead
+
+
+def test_cells_that_leave_the_other_cloud_say_nothing():
+    src, dst = (surface(plane(s, 30_000), 0.1) for s in (0, 1))
+    found = lead(STILL, motion([0, 0, 0], [1.5, 0, 0]), src, dst)
+    assert abs(found.share) < 0.02
+
+
+def test_the_worse_of_two_leads_takes_the_worse_of_both():
+    assert Lead(0.3, 0.2).at_worst(Lead(0.1, 0.05)) == Lead(0.1, 0.2)

@@ -70,6 +70,8 @@ def test_more_columns_and_records_are_read():
         np.testing.assert_array_equal(as_cloud(given).points, as_cloud(points).points)
     cloud = as_cloud(points)
     assert as_cloud(cloud) is cloud
+    with pytest.raises(ValueError, match="was read already"):
+        as_cloud(cloud, max_range=3.0)
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,8 @@ def as_cloud(
         ValueError: If it cannot be read, or fewer than 100 points are left.
     """
     if isinstance(value, Cloud):
+        if not (viewpoint is None and crop is None and max_range is None):
+            raise ValueError(f"{name} was read already: give viewpoint, crop and max_range when it is read.")
         return value
     rows = real_numbers(coordinates_of(value), name)
     if rows.ndim != 2 or rows.shape[1] < 3:

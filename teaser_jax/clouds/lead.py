@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from teaser_jax.clouds.pairing import LINES, pair
+from teaser_jax.clouds.pairing import ACROSS, ALIGNED, LINES, Pairing, pair
 from teaser_jax.clouds.surface import Surface
 
 MARGIN = 3.0  # cells: so far inside the hull of a cloud must a cell lie to say anything
@@ -28,6 +28,10 @@ class Lead(NamedTuple):
 
     share: float
     against: float
+
+    def at_worst(self, other: Lead) -> Lead:
+        """Take of two leads the smaller share, and what speaks more against it."""
+        return Lead(min(self.share, other.share), max(self.against, other.against))
 
 
 def lead(pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], src: Surface, dst: Surface) -> Lead:
@@ -51,10 +55,20 @@ def _weights(
 ) -> tuple[float, float, float]:
     """Weigh the cells that the first explains alone, the other alone, and both."""
     here, there = pair(pose, src, dst), pair(other, src, dst)
-    says_here, says_there = (x.near | _within_hull(x.points, dst) for x in (here, there))
+    says_here, says_there = (_would_show(x, dst) for x in (here, there))
     kinds = here.fits & ~there.fits & says_there, there.fits & ~here.fits & says_here, here.fits & there.fits
     ours, theirs, both = (float(here.weight[kind].sum()) for kind in kinds)
     return ours, theirs, both
+
+
+def _would_show(pairing: Pairing, dst: Surface) -> Bool[np.ndarray, " n"]:
+    """Tell which cells would lie on the other surface if the pose were right.
+
+    A cell in the plane of the nearest one and further along lies behind an edge of what was seen there.
+    """
+    cosine = np.sum(pairing.normals * pairing.partner_normals, axis=1)
+    level = (np.abs(pairing.residual) < ACROSS * dst.voxel_size) & (cosine > ALIGNED)
+    return np.where(pairing.near, pairing.fits | ~level, _within_hull(pairing.points, dst))
 
 
 def _within_hull(points: Float[np.ndarray, "n 3"], surface: Surface) -> Bool[np.ndarray, " n"]:

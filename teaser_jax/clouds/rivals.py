@@ -32,7 +32,7 @@ class Rivals(NamedTuple):
     Attributes:
         equal: Which part of the fitting cells fits in the other pose that is most like it [-].
         fit: The fit of that pose [-].
-        lead: How far the pose is ahead of the one that comes nearest.
+        lead: How far the pose is ahead of all of them, at the least.
         poses: Those in which nearly all of its cells fit.
     """
 
@@ -88,8 +88,10 @@ def find_rivals(
         if apart(other @ np.linalg.inv(pose)) < DIFFERENT * cell:  # it fell back: judge it where it stood
             other = motions[k] @ pose
         share = _share(pair(other, src, dst, asked), ASKED // 2)
-        nearest = min(found.lead, lead(pose, other, src, dst))
-        found = found._replace(lead=nearest, poses=(*found.poses, other) if share > LIKE else found.poses)
+        found = found._replace(
+            lead=found.lead.at_worst(lead(pose, other, src, dst)),
+            poses=(*found.poses, other) if share > LIKE else found.poses,
+        )
         if share > found.equal or found.fit == 0:
             found = found._replace(equal=share, fit=min(x.fit for x in both_ways(other, src, dst)))
     return found

@@ -33,7 +33,7 @@ LEAST_VISIBLE = 0.008
 MOST_EQUAL, MOST_OF_FIT = 0.80, 0.82
 # Where the pose is so far ahead of all others, it counts whatever they reach: with a cupboard in a box room
 # it is 0.13 ahead, in a corridor one door further on, or on stairs a step, 0.08 at most.
-ENOUGH_LEAD, MOST_AGAINST, GOOD_FIT = 0.10, 0.15, 0.60
+ENOUGH_LEAD, MOST_AGAINST, GOOD_FIT = 0.10, 0.20, 0.60
 
 
 @dataclass(frozen=True, eq=False)
