@@ -18,16 +18,15 @@ from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.matching import Nearest, chosen, nearest_of
 from teaser_jax.clouds.pairing import both_ways
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.verdict import CELLS, FEWEST_CELLS
 from teaser_jax.clouds.voxel import downsample, voxel_size_for_both
 from teaser_jax.register import Registration, register
 from teaser_jax.settings import ExactClique, Settings
 
-CELLS = 6000  # of the smaller cloud, at the width at which candidates are compared
 MOST_CELLS = 200_000  # of the larger one
 MOST_MATCHES = 5000
 FEWEST_MATCHES = 5
 ENOUGH = 0.30  # a fit at which nobody looks further
-FEWEST_CELLS = 300
 SECONDS = 2.0  # a clique may be searched
 
 
@@ -57,7 +56,7 @@ class Candidate:
 
     Attributes:
         pose: From the source to the target, each about its middle, as its ``Cloud`` holds it.
-        fit: Which part of the overlap fits at the width of comparison [-].
+        fit: Which part of the overlap fits at the width of the verdict [-].
         cells: How many cells fit.
         stage: How its matches were found.
         registration: The answer of ``register`` to them.
@@ -128,7 +127,7 @@ class Pair:
         return Candidate(*found, stage, registration)
 
     def compared(self, pose: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, "4 4"], float, int]:
-        """Align a pose at the width of comparison: the pose, its fit, and how many cells fit."""
+        """Align a pose at the width of the verdict: the pose, its fit, and how many cells fit."""
         src, dst = self.surfaces(CELLS)
         pose = align(align(pose, src, dst, reach=3.0), src, dst)
         here, back = both_ways(pose, src, dst)

@@ -31,7 +31,6 @@ class Pairing:
         residual: How far the cell lies before the plane of its partner [length].
         near: Which cells have one within three cells: the overlap.
         fits: Which cells lie on the other surface, with their normal along its own.
-        cell: Width of a cell [length].
     """
 
     points: Float[np.ndarray, "n 3"]
@@ -42,7 +41,6 @@ class Pairing:
     residual: Float[np.ndarray, " n"]
     near: Bool[np.ndarray, " n"]
     fits: Bool[np.ndarray, " n"]
-    cell: float
 
     @cached_property
     def weight(self) -> Float[np.ndarray, " n"]:
@@ -77,21 +75,19 @@ def pair(
         rows: The cells of the source to ask about; None: all.
     """
     points, normals = (src.points, src.normals) if rows is None else (src.points[rows], src.normals[rows])
-    rotation = pose[:3, :3]
-    moved, across = points @ rotation.T + pose[:3, 3], normals @ rotation.T
-    partner, theirs, distance, residual, near, fits = _compared(moved, across, dst)
-    return Pairing(moved, across, partner, theirs, distance, residual, near, fits, dst.voxel_size)
+    there, across = moved(pose, points), normals @ pose[:3, :3].T
+    return Pairing(there, across, *_compared(there, across, dst))
 
 
 def _compared(
-    moved: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], dst: Surface
+    there: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], dst: Surface
 ) -> tuple[np.ndarray, ...]:
     """Compare cells with the nearest ones of a surface: which, their normals, how far, and what fits."""
-    partner, distance = dst.tree.nearest(moved)
+    partner, distance = dst.tree.nearest(there)
     theirs = dst.normals[partner]
     cosine = np.sum(across * theirs, axis=1)
     theirs = np.where((cosine < 0)[:, None], -theirs, theirs)
-    residual = np.sum((moved - dst.points[partner]) * theirs, axis=1)
+    residual = np.sum((there - dst.points[partner]) * theirs, axis=1)
     cell = dst.voxel_size
     fits = (distance < CLOSE * cell) & (np.abs(residual) < ACROSS * cell) & (np.abs(cosine) > ALIGNED)
     return partner, theirs, distance, residual, distance < NEAR * cell, fits
@@ -116,11 +112,10 @@ def shares(
     """
     found = []
     for some in np.split(poses, range(POSES_AT_ONCE, len(poses), POSES_AT_ONCE)):
-        moved = src.points[rows] @ np.swapaxes(some[:, :3, :3], 1, 2) + some[:, None, :3, 3]
-        across = src.normals[rows] @ np.swapaxes(some[:, :3, :3], 1, 2)
-        near, fits = (
-            x.reshape(len(some), -1) for x in _compared(moved.reshape(-1, 3), across.reshape(-1, 3), dst)[-2:]
-        )
+        turns = np.swapaxes(some[:, :3, :3], 1, 2)
+        there, across = src.points[rows] @ turns + some[:, None, :3, 3], src.normals[rows] @ turns
+        *_, near, fits = _compared(there.reshape(-1, 3), across.reshape(-1, 3), dst)
+        near, fits = near.reshape(len(some), -1), fits.reshape(len(some), -1)
         overlap = np.maximum(np.count_nonzero(near, axis=1), len(rows) / 2)
         found.append(np.count_nonzero(fits, axis=1) / overlap)
     return np.concatenate(found) if found else np.zeros(0)
