@@ -13,7 +13,7 @@ pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
 from teaser_jax.clouds.candidates import STAGES, Pair, candidates
 from teaser_jax.clouds.cloud import as_cloud
-from teaser_jax.clouds.verdict import judge
+from teaser_jax.clouds.trust.judge import judge
 
 SCENES = {
     "landscape": (terrain(0, 30_000, 0, 20), terrain(1, 30_000, 8, 28)),

@@ -11,10 +11,10 @@ from oracles import random_pose
 
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
-from teaser_jax.clouds.fpfh import Descriptors, fpfh
-from teaser_jax.clouds.matching import match, nearest
+from teaser_jax.clouds.features.fpfh import Descriptors, fpfh
+from teaser_jax.clouds.features.matching import match, nearest
+from teaser_jax.clouds.features.normals import normals
 from teaser_jax.clouds.neighbours import Neighbours, Tree
-from teaser_jax.clouds.normals import normals
 from teaser_jax.clouds.sizes import rows_for
 from teaser_jax.clouds.surface import Surface
 

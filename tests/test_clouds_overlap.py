@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
 from teaser_jax.clouds.fine import align
-from teaser_jax.clouds.lead import Lead, lead
-from teaser_jax.clouds.observability import observability
-from teaser_jax.clouds.pairing import both_ways, direction_weights, pair
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.trust.lead import Lead, lead
+from teaser_jax.clouds.trust.observability import observability
+from teaser_jax.clouds.trust.pairing import both_ways, direction_weights, pair
 from teaser_jax.clouds.voxel import downsample
 
 STILL = np.eye(4)

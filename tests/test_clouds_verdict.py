@@ -26,7 +26,7 @@ import teaser_jax as tj
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
 from teaser_jax.clouds.cloud import as_cloud
-from teaser_jax.clouds.verdict import judge
+from teaser_jax.clouds.trust.judge import judge
 
 STILL = np.eye(4)
 MANY = 20_000

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.clouds.cloud import Cloud
+from teaser_jax.clouds.features.matching import Nearest, chosen, nearest_of
 from teaser_jax.clouds.fine import align
-from teaser_jax.clouds.matching import Nearest, chosen, nearest_of
-from teaser_jax.clouds.pairing import both_ways
 from teaser_jax.clouds.surface import Surface
-from teaser_jax.clouds.verdict import CELLS, FEWEST_CELLS
+from teaser_jax.clouds.trust.judge import CELLS, FEWEST_CELLS
+from teaser_jax.clouds.trust.pairing import both_ways
 from teaser_jax.clouds.voxel import downsample, voxel_size_for_both
 from teaser_jax.register import Registration, register
 from teaser_jax.settings import ExactClique, Settings

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax.clouds.extra import small_gicp
-from teaser_jax.clouds.fpfh import Descriptors, fpfh
+from teaser_jax.clouds.features.fpfh import Descriptors, fpfh
+from teaser_jax.clouds.features.normals import across, oriented
 from teaser_jax.clouds.neighbours import Neighbours, Tree
-from teaser_jax.clouds.normals import across, oriented
 from teaser_jax.clouds.sizes import rows_for
 
 NEIGHBOURS = 120  # of each point, for descriptors, of which those within the radius count

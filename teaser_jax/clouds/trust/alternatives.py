@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax import so3
-from teaser_jax.clouds.observability import Observability
-from teaser_jax.clouds.pairing import LINES
+from teaser_jax.clouds.trust.observability import Observability
+from teaser_jax.clouds.trust.pairing import LINES
 
 SLIDES = (-6.0, -3.0, 3.0, 6.0)  # cells, along motions that the normals hardly see
 TURNS = np.radians([60.0, 90.0, 120.0, 180.0, 270.0])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from teaser_jax.clouds.pairing import Pairing
+from teaser_jax.clouds.trust.pairing import Pairing
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from teaser_jax.clouds.alternatives import alternatives
 from teaser_jax.clouds.fine import align
-from teaser_jax.clouds.lead import Lead, lead
-from teaser_jax.clouds.observability import Observability
-from teaser_jax.clouds.pairing import Pairing, both_ways, moved, pair, shares
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.trust.alternatives import alternatives
+from teaser_jax.clouds.trust.lead import Lead, lead
+from teaser_jax.clouds.trust.observability import Observability
+from teaser_jax.clouds.trust.pairing import Pairing, both_ways, moved, pair, shares
 
 DIFFERENT = 2.5  # cells of displacement on average that make another pose
 ASKED, SCREENED, FIRST_LOOK = 400, 200, 50  # cells asked of alternatives: the last, the better, all

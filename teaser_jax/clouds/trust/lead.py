@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from teaser_jax.clouds.pairing import ACROSS, ALIGNED, LINES, Pairing, pair
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.trust.pairing import ACROSS, ALIGNED, LINES, Pairing, pair
 
 MARGIN = 3.0  # cells: so far inside the hull of a cloud must a cell lie to say anything
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from teaser_jax.clouds.fpfh import Descriptors
+from teaser_jax.clouds.features.fpfh import Descriptors
 from teaser_jax.clouds.sizes import rows_for
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.checks import whole_number

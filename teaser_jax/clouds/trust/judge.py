@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.clouds.fine import align
-from teaser_jax.clouds.observability import Observability, observability
-from teaser_jax.clouds.pairing import both_ways, moved
-from teaser_jax.clouds.rivals import Rivals, find_rivals
 from teaser_jax.clouds.surface import FEW_NEIGHBOURS, Surface
+from teaser_jax.clouds.trust.observability import Observability, observability
+from teaser_jax.clouds.trust.pairing import both_ways, moved
+from teaser_jax.clouds.trust.rivals import Rivals, find_rivals
 from teaser_jax.clouds.voxel import downsample, voxel_size_for_both
 from teaser_jax.solution import Status
 
