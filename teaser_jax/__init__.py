@@ -1,7 +1,7 @@
 """Robust 3-D point-cloud registration that is certifiable, differentiable and batched, in JAX.
 
-``register`` is the door for one pair on the host; ``solve`` is the same under jit, vmap and grad;
-``solve_batch`` takes thousands. Everything loads when it is first used.
+``register_clouds`` takes two raw clouds and ``register`` matched points, both on the host; ``solve`` is the
+latter under jit, vmap and grad; ``solve_batch`` takes thousands. Everything loads when it is first used.
 """
 
 import sys
@@ -20,6 +20,9 @@ if TYPE_CHECKING:  # for editors and type checkers: at run time the table below 
     from teaser_jax.certify.pose import certify
     from teaser_jax.certify.rotation import certify_rotation
     from teaser_jax.certify.verify import verify
+    from teaser_jax.clouds.prepared import prepare
+    from teaser_jax.clouds.register import register_clouds
+    from teaser_jax.clouds.registration import CloudRegistration
     from teaser_jax.pose import Pose
     from teaser_jax.problem import Problem, host_problem, make_problem, stack_problems
     from teaser_jax.profile import profile
@@ -35,6 +38,8 @@ if TYPE_CHECKING:  # for editors and type checkers: at run time the table below 
 
 # The module that each name of the front page lives in.
 _HOMES = {
+    "register_clouds": "clouds.register", "CloudRegistration": "clouds.registration",
+    "prepare": "clouds.prepared",
     "register": "register", "Registration": "register", "warmup": "register", "profile": "profile",
     "solve": "solve", "select": "solve", "refit": "refit", "soft_solve": "soft",
     "solve_batch": "solve_batch", "solve_rotation": "solve_rotation",
@@ -47,11 +52,11 @@ _HOMES = {
 _MODULES = ("files", "learn", "metrics", "plots", "settings", "so3", "studies", "synthetic")
 
 __all__ = [
-    "Certificate", "Pose", "Problem", "Registration", "Selection", "Settings", "Solution", "Status",
-    "certify", "certify_rotation", "covariance", "error_bounds", "files", "host_problem", "learn",
-    "make_problem", "metrics", "plots", "profile", "refit", "register", "select", "settings", "so3",
-    "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic",
-    "verify", "warmup",
+    "Certificate", "CloudRegistration", "Pose", "Problem", "Registration", "Selection", "Settings",
+    "Solution", "Status", "certify", "certify_rotation", "covariance", "error_bounds", "files",
+    "host_problem", "learn", "make_problem", "metrics", "plots", "prepare", "profile", "refit",
+    "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve", "solve_batch",
+    "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
 ]  # fmt: skip
 
 

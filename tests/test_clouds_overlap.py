@@ -45,8 +45,10 @@ def test_pairs_are_those_of_a_full_table():
     found = pair(pose, src, dst)
     moved = src.points @ pose[:3, :3].T + pose[:3, 3]
     table = np.linalg.norm(moved[:, None] - dst.points[None], axis=2)
-    np.testing.assert_array_equal(found.partner, table.argmin(axis=1))
-    np.testing.assert_allclose(found.distance, table.min(axis=1), atol=1e-12)
+    np.testing.assert_array_equal(found.near, table.min(axis=1) < 3)
+    np.testing.assert_array_equal(found.partner[found.near], table.argmin(axis=1)[found.near])
+    np.testing.assert_allclose(found.distance[found.near], table.min(axis=1)[found.near], atol=1e-12)
+    assert (found.distance[~found.near] >= 3).all()
     for k in np.flatnonzero(found.fits):
         across = dst.normals[found.partner[k]]
         assert abs((moved[k] - dst.points[found.partner[k]]) @ across) < 0.35

@@ -9,6 +9,7 @@ from cloud_scenes import plane, terrain
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
 from teaser_jax.clouds.cloud import Cloud, as_cloud
+from teaser_jax.clouds.neighbours import Tree
 from teaser_jax.clouds.voxel import count_cells, downsample, spacing, voxel_size_for
 
 
@@ -135,8 +136,8 @@ def test_the_width_of_odd_clouds_is_a_number_above_zero():
 
 def test_spacing_is_the_usual_distance_to_the_nearest():
     grid = np.stack(np.meshgrid(*[0.25 * np.arange(12.0)] * 3), axis=-1).reshape(-1, 3)
-    assert spacing(grid) == pytest.approx(0.25)
-    assert spacing(grid[:1]) == 0
+    assert spacing(Tree(grid)) == pytest.approx(0.25)
+    assert spacing(Tree(grid[:1])) == 0
 
 
 def test_cells_too_many_to_number_are_refused_without_a_word_on_the_terminal(capfd):

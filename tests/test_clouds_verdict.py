@@ -26,6 +26,8 @@ import teaser_jax as tj
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
 from teaser_jax.clouds.cloud import as_cloud
+from teaser_jax.clouds.pair import Pair
+from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.clouds.trust.judge import judge
 
 STILL = np.eye(4)
@@ -38,7 +40,7 @@ def judged(src: np.ndarray, dst: np.ndarray, pose: np.ndarray = STILL):
     a, b = as_cloud(src), as_cloud(dst)
     near = pose.copy()
     near[:3, 3] += pose[:3, :3] @ a.origin - b.origin
-    return judge(near, a.points, b.points)
+    return judge(near, Pair(Prepared(a), Prepared(b)))
 
 
 def faces(built: list) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +63,7 @@ FREE = {
 @pytest.mark.parametrize("name", FREE)
 def test_what_slides_or_turns_is_degenerate(name: str):
     found = judged(*FREE[name])
-    assert found.status == tj.Status.DEGENERATE
+    assert found.verdict.status == tj.Status.DEGENERATE
     assert found.evidence.seen.visible[0] < 0.008
 
 
@@ -76,14 +78,14 @@ EQUAL = {
 @pytest.mark.parametrize("name", EQUAL)
 def test_what_fits_twice_is_ambiguous(name: str):
     found = judged(*faces(EQUAL[name]))
-    assert found.status == tj.Status.AMBIGUOUS
+    assert found.verdict.status == tj.Status.AMBIGUOUS
     assert len(found.evidence.rivals.poses) > 0
 
 
 def test_a_corridor_of_even_doors_is_never_trusted():
     for on in (0, 6, 8):
         src, dst = on_faces(0, MANY, corridor(0, 20, DOORS)), on_faces(1, MANY, corridor(on, 20 + on, DOORS))
-        assert judged(src, dst).status in (tj.Status.DEGENERATE, tj.Status.AMBIGUOUS)
+        assert judged(src, dst).verdict.status in (tj.Status.DEGENERATE, tj.Status.AMBIGUOUS)
 
 
 SOUND = {
@@ -98,11 +100,11 @@ SOUND = {
 def test_a_sound_scene_is_trusted_where_the_pose_is_right_and_nowhere_else(name: str):
     src, dst = SOUND[name]
     found = judged(src, dst)
-    assert found.status == tj.Status.OK
+    assert found.verdict.status == tj.Status.OK
     assert found.evidence.displacement < found.evidence.voxel_size
     turned = np.eye(4)
     turned[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    assert judged(src, dst, turned).status != tj.Status.OK
+    assert judged(src, dst, turned).verdict.status != tj.Status.OK
 
 
 def test_a_pose_that_is_off_by_a_voxel_is_aligned_before_it_is_judged():
@@ -110,7 +112,7 @@ def test_a_pose_that_is_off_by_a_voxel_is_aligned_before_it_is_judged():
     off = np.eye(4)
     off[:3, 3] = 0.2
     found, right = judged(src, dst, off), judged(src, dst)
-    assert found.status == tj.Status.OK
+    assert found.verdict.status == tj.Status.OK
     # Gentle hills hold a slide loosely: what is promised is two cells.
     np.testing.assert_allclose(found.pose, right.pose, atol=right.evidence.voxel_size)
 
@@ -125,7 +127,7 @@ def test_the_same_clouds_get_the_same_bits():
 
 def test_a_block_is_told_from_its_turned_self():
     src, dst = faces(BLOCK)
-    assert judged(src, dst).status in (tj.Status.OK, tj.Status.AMBIGUOUS)
+    assert judged(src, dst).verdict.status in (tj.Status.OK, tj.Status.AMBIGUOUS)
     half = np.eye(4)
     half[:3, :3], half[:3, 3] = np.diag([-1.0, -1, 1]), [2, 1, 0]
-    assert judged(src, dst, half).status != tj.Status.OK
+    assert judged(src, dst, half).verdict.status != tj.Status.OK

@@ -7,26 +7,28 @@ the clouds themselves is nearly always the best of them, whatever its matches sa
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
-from teaser_jax.clouds.cloud import Cloud
+from teaser_jax.clouds.features.fpfh import Descriptors
 from teaser_jax.clouds.features.matching import Nearest, chosen, nearest_of
 from teaser_jax.clouds.fine import align
+from teaser_jax.clouds.pair import Pair
+from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.judge import CELLS, FEWEST_CELLS
 from teaser_jax.clouds.trust.pairing import both_ways
-from teaser_jax.clouds.voxel import downsample, voxel_size_for_both
+from teaser_jax.ground.arrays import AnyArray
+from teaser_jax.pose import Pose
 from teaser_jax.register import Registration, register
 from teaser_jax.settings import ExactClique, Settings
 
 MOST_CELLS = 200_000  # of the larger one
 MOST_MATCHES = 5000
 FEWEST_MATCHES = 5
-ENOUGH = 0.30  # a fit at which nobody looks further
 SECONDS = 2.0  # a clique may be searched
 
 
@@ -55,18 +57,19 @@ class Candidate:
     """A pose that may be right.
 
     Attributes:
-        pose: From the source to the target, each about its middle, as its ``Cloud`` holds it.
+        pose: From the source to the target, in the frames as given.
         fit: Which part of the overlap fits at the width of the verdict [-].
         cells: How many cells fit.
-        stage: How its matches were found.
-        registration: The answer of ``register`` to them.
+        found_by: How it was found.
+        registration: The answer of ``register`` to the matches, in the frames as given; None: it was found
+            in another way.
     """
 
-    pose: Float[np.ndarray, "4 4"]
+    pose: Pose
     fit: float
     cells: int
-    stage: Stage
-    registration: Registration
+    found_by: str
+    registration: Registration | None
 
     @property
     def score(self) -> float:
@@ -75,73 +78,93 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
-    """Two clouds, with what was found at each width of cells, so that nothing is computed twice."""
+class Search:
+    """The search for candidates of one pair, with what was matched at each width of cells.
 
-    src: Cloud
-    dst: Cloud
-    threads: int = 1
-    seconds: dict[str, float] = field(default_factory=dict)
-    _surfaces: dict[int, tuple[Surface, Surface]] = field(default_factory=dict)
+    Attributes:
+        pair: The clouds.
+        described: Descriptors for each point of the source and of the target; None: those of the shape.
+        end: When the work has to end, on the clock of ``time.perf_counter``; None: never.
+    """
+
+    pair: Pair
+    described: tuple[AnyArray, AnyArray] | None = None
+    end: float | None = None
     _nearest: dict[int, Nearest] = field(default_factory=dict)
 
-    def surfaces(self, cells: int) -> tuple[Surface, Surface]:
-        """Cut both clouds into cells, about so many of the smaller one."""
-        if cells not in self._surfaces:
-            start = time.perf_counter()
-            size = voxel_size_for_both(self.src.points, self.dst.points, cells, MOST_CELLS)
-            self._surfaces[cells] = tuple(  # type: ignore[assignment]
-                Surface(downsample(x.points, size), size, x.viewpoint, self.threads)
-                for x in (self.src, self.dst)
-            )
-            self._spent("cells", start)
-        return self._surfaces[cells]
+    @property
+    def seconds_left(self) -> float:
+        """The time that is left; infinite if there is no end."""
+        return np.inf if self.end is None else max(0.0, self.end - time.perf_counter())
 
     def matches(self, stage: Stage) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """Match points of both surfaces, the clearest matches first."""
-        src, dst = self.surfaces(stage.cells)
-        start = time.perf_counter()
-        described = src.descriptors, dst.descriptors
-        self._spent("descriptors", start)
-        start = time.perf_counter()
-        if stage.cells not in self._nearest:
-            self._nearest[stage.cells] = nearest_of(*described)
-        valid = [np.asarray(x.valid) for x in described]
-        found = chosen(self._nearest[stage.cells], *valid, mutual=stage.mutual, most=MOST_MATCHES)
-        self._spent("matching", start)
-        return src.points[found.rows[:, 0]], dst.points[found.rows[:, 1]]
+        """Match points of both clouds, in the frames as given, the clearest matches first."""
+        pair = self.pair
+        src, dst = pair.surfaces(stage.cells, MOST_CELLS)
+        with pair.timed("descriptors"):
+            a, b = self._descriptors(src, dst)
+        with pair.timed("matching"):
+            if stage.cells not in self._nearest:
+                self._nearest[stage.cells] = nearest_of(a, b)
+            valid = np.asarray(a.valid), np.asarray(b.valid)
+            found = chosen(self._nearest[stage.cells], *valid, mutual=stage.mutual, most=MOST_MATCHES)
+            return (
+                (src.points[found.rows[:, 0]] + pair.src.cloud.origin) / pair.scale,
+                dst.points[found.rows[:, 1]] + pair.dst.cloud.origin,
+            )
 
     def candidate(self, stage: Stage) -> Candidate | None:
         """Find the candidate of one stage; None: there are no matches to speak of."""
         src, dst = self.matches(stage)
         if len(src) < FEWEST_MATCHES:
             return None
-        start = time.perf_counter()
-        size = self.surfaces(stage.cells)[1].voxel_size
-        settings = Settings(clique=ExactClique(seconds=SECONDS))
-        registration = register(src, dst, noise_bound=stage.bound * size, settings=settings)
-        self._spent("register", start)
-        start = time.perf_counter()
-        found = self.compared(np.array(registration.pose.matrix, np.float64))
-        self._spent("comparison", start)
-        return Candidate(*found, stage, registration)
+        pair = self.pair
+        bound = stage.bound * pair.width(stage.cells, MOST_CELLS)
+        settings = Settings(clique=ExactClique(seconds=max(0.01, min(SECONDS, self.seconds_left))))
+        with pair.timed("register"):
+            found = register(src, dst, noise_bound=bound, scale=pair.scale, settings=settings)
+        return self.compared(found.pose, str(stage), found)
 
-    def compared(self, pose: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, "4 4"], float, int]:
-        """Align a pose at the width of the verdict: the pose, its fit, and how many cells fit."""
-        src, dst = self.surfaces(CELLS)
-        pose = align(align(pose, src, dst, reach=3.0), src, dst)
-        here, back = both_ways(pose, src, dst)
-        return pose, min(here.fit, back.fit), min(here.count, back.count)
+    def compared(self, pose: Pose, found_by: str, registration: Registration | None) -> Candidate:
+        """Align a pose at the width of the verdict, and tell how well the clouds fit there."""
+        pair = self.pair
+        src, dst = pair.surfaces(CELLS, MOST_CELLS)
+        with pair.timed("alignment"):
+            aligned = align(align(pair.centred(pose), src, dst, reach=3.0), src, dst)
+            here, back = both_ways(aligned, src, dst)
+        fit, cells = min(here.fit, back.fit), min(here.count, back.count)
+        return Candidate(pair.given(aligned), fit, cells, found_by, registration)
 
-    def _spent(self, name: str, start: float) -> None:
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+    def _descriptors(self, src: Surface, dst: Surface) -> tuple[Descriptors, Descriptors]:
+        if self.described is None:
+            return src.descriptors, dst.descriptors
+        clouds = self.pair.src, self.pair.dst
+        a, b = (
+            nearest_descriptors(cloud, surface, values)
+            for cloud, surface, values in zip(clouds, (src, dst), self.described, strict=True)
+        )
+        return a, b
 
 
-def candidates(pair: Pair) -> Iterator[Candidate]:
-    """Find candidates stage by stage; end after one that fits."""
+def nearest_descriptors(cloud: Prepared, surface: Surface, values: AnyArray) -> Descriptors:
+    """Give each cell the descriptor of the point nearest to its mean, among those with finite numbers."""
+    rows = cloud.tree.nearest(surface.points)[0]
+    values = np.asarray(values, np.float32)[rows]
+    valid = np.isfinite(values).all(axis=1)
+    return Descriptors(np.where(valid[:, None], values, 0), valid)
+
+
+def candidates(search: Search, show: Callable[[str], None]) -> Iterator[Candidate]:
+    """Find candidates way by way, until nobody asks for more or the time is over.
+
+    Args:
+        search: The clouds, and what was found of them.
+        show: A function that is told what is being done.
+    """
     for stage in STAGES:
-        found = pair.candidate(stage)
+        show(f"matching {stage}")
+        found = search.candidate(stage)
         if found is not None:
             yield found
-            if found.score >= ENOUGH:
-                return
+        if search.seconds_left == 0:
+            return

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,6 +13,8 @@ from teaser_jax.ground.checks import one_of
 
 METHODS = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
 ROUNDS = 30
+STRAY = 10.0  # cells that a pose is moved by at the most: points further away take no part
+FEWEST, NEARLY_ALL = 20, 0.9  # points that take part; from this share on all do
 SETTLED = 1e-3, 1e-4  # cells and radians in one round
 
 
@@ -31,7 +35,9 @@ def align(
     """
     one_of("method", method, METHODS)
     target, tree = dst.for_alignment
-    source, _ = src.for_alignment
+    source = _in_reach(pose, src, dst, (reach + STRAY) * dst.voxel_size)
+    if source is None:
+        return pose
     found = small_gicp().align(
         target,
         source,
@@ -46,3 +52,18 @@ def align(
     )
     moved = np.array(found.T_target_source)
     return moved if np.isfinite(moved).all() else pose
+
+
+def _in_reach(pose: Float[np.ndarray, "4 4"], src: Surface, dst: Surface, reach: float) -> Any:
+    """Choose the points of the source that may meet the target, as the library holds them; None: few are.
+
+    The search for the nearest takes longest over points far away from all others.
+    """
+    there = src.points @ pose[:3, :3].T + pose[:3, 3]
+    near = dst.tree.in_reach(there, reach)
+    count = int(np.count_nonzero(near))
+    if count < FEWEST:
+        return None
+    if count > NEARLY_ALL * len(near):
+        return src.for_alignment[0]
+    return Surface(src.points[near], src.voxel_size, threads=src.threads).for_alignment[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -38,20 +39,42 @@ class Tree:
     def __init__(self, points: Float[np.ndarray, "n 3"], threads: int = 1) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
         self.threads = threads
-        self._tree = small_gicp().KdTree(self.points, num_threads=threads)
+        held = small_gicp().PointCloud(self.points)
+        self.held = held, small_gicp().KdTree(held, num_threads=threads)  # as the library takes them
 
     def nearest(
-        self, asked: Float[np.ndarray, "m 3"]
+        self, asked: Float[np.ndarray, "m 3"], within: float = np.inf
     ) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Find the nearest point of each point asked about, and how far it is [length]."""
-        found = self.neighbours(asked, 1)
-        return found.rows[:, 0], np.sqrt(found.squared[:, 0])
+        """Find the nearest point of each point asked about, and how far it is [length].
+
+        Args:
+            asked: The points.
+            within: Points further than this from all others, which can be told by the box around these, need
+                no answer: they get row 0, infinitely far. A tree takes longest over those [length].
+        """
+        asked = np.ascontiguousarray(asked, np.float64)
+        near = self.in_reach(asked, within)
+        rows, distance = np.zeros(len(asked), np.int32), np.full(len(asked), np.inf)
+        if near.any():
+            found = self.neighbours(asked[near], 1)
+            rows[near], distance[near] = found.rows[:, 0], np.sqrt(found.squared[:, 0])
+        return rows, distance
+
+    def in_reach(self, asked: Float[np.ndarray, "m 3"], within: float) -> Bool[np.ndarray, " m"]:
+        """Tell which points lie in the box around these, or not much outside."""
+        low, high = self.box
+        return ((asked >= low - within) & (asked <= high + within)).all(axis=1)
+
+    @cached_property
+    def box(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """The lower and the upper corner of the box around the points [length]."""
+        return self.points.min(axis=0), self.points.max(axis=0)
 
     def neighbours(self, asked: Float[np.ndarray, "m 3"], count: int) -> Neighbours:
         """Find the ``count`` nearest points of each point asked about; itself, too, if it is one of them."""
         asked = np.ascontiguousarray(asked, np.float64)
         most = min(count, len(self.points))
-        index, squared = self._tree.batch_knn_search(asked, most, num_threads=self.threads)
+        index, squared = self.held[1].batch_knn_search(asked, most, num_threads=self.threads)
         found = np.asarray(index).astype(np.int64)  # none is -1
         none = (found < 0) | (found >= len(self.points))
         here = Neighbours(

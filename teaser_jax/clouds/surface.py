@@ -33,14 +33,12 @@ class Surface:
         voxel_size: Width of a cell [length].
         viewpoint: Where the sensor stood; None: unknown.
         threads: How many threads to ask neighbours with.
-        count: How many neighbours of each point to know: descriptors need all, normals few.
     """
 
     points: Float[np.ndarray, "n 3"]
     voxel_size: float
     viewpoint: Float[np.ndarray, "3"] | None = None
     threads: int = 1
-    count: int = NEIGHBOURS
 
     def __len__(self) -> int:
         return len(self.points)
@@ -51,18 +49,33 @@ class Surface:
         return Tree(self.points, self.threads)
 
     @cached_property
-    def neighbours(self) -> Neighbours:
-        """The nearest points of each."""
-        return self.tree.neighbours(self.points, self.count)
-
-    @cached_property
     def normals(self) -> Float[np.ndarray, "n 3"]:
         """Unit normals, zero where the points make no surface."""
+        return self._normals(self.tree.neighbours(self.points, FEW_NEIGHBOURS))
+
+    @cached_property
+    def descriptors(self) -> Descriptors:
+        """What the surroundings of each point look like."""
+        # One question serves both. What it finds is not kept: nothing else of a cloud is as large.
+        neighbours = self.tree.neighbours(self.points, NEIGHBOURS)
+        if "normals" not in self.__dict__:  # where cached_property keeps it
+            self.__dict__["normals"] = self._normals(neighbours)
+        orientation = "local" if self.viewpoint is None else "given"
+        found = fpfh(*self._padded(neighbours), np.float32(FEATURE_RADIUS), orientation=orientation)
+        return Descriptors(*(x[: len(self)] for x in jax.device_get(found)))
+
+    @cached_property
+    def for_alignment(self) -> Any:
+        """The points with their covariances, and their tree, as the library of alignment holds them."""
+        small_gicp().estimate_normals_covariances(*self.tree.held, COVARIANCE_NEIGHBOURS, self.threads)
+        return self.tree.held
+
+    def _normals(self, neighbours: Neighbours) -> Float[np.ndarray, "n 3"]:
         found = []
         for start in range(0, len(self), ROWS_OF_NORMALS):
             rows = slice(start, start + ROWS_OF_NORMALS)
-            near = self.neighbours.squared[rows, :FEW_NEIGHBOURS]
-            there = self.points[self.neighbours.rows[rows, :FEW_NEIGHBOURS]]
+            near = neighbours.squared[rows, :FEW_NEIGHBOURS]
+            there = self.points[neighbours.rows[rows, :FEW_NEIGHBOURS]]
             apart = (there - self.points[rows, None]) / self.voxel_size
             missing = ROWS_OF_NORMALS - len(near)  # one program for clouds of any size
             apart = np.pad(apart.astype(np.float32), ((0, missing), (0, 0), (0, 0)))
@@ -70,32 +83,12 @@ class Surface:
             found.append(np.asarray(across(apart, squared, np.float32(NORMAL_RADIUS)))[: len(near)])
         return oriented(np.concatenate(found).astype(np.float64), self.points, self.viewpoint)
 
-    @cached_property
-    def descriptors(self) -> Descriptors:
-        """What the surroundings of each point look like."""
-        points, neighbours = self._padded
-        rows = np.zeros(points.shape, np.float32)
-        rows[: len(self)] = self.normals
-        orientation = "local" if self.viewpoint is None else "given"
-        found = fpfh(points, rows, neighbours, np.float32(FEATURE_RADIUS), orientation=orientation)
-        return Descriptors(*(x[: len(self)] for x in jax.device_get(found)))
-
-    @cached_property
-    def for_alignment(self) -> Any:
-        """The points as the library of fine registration holds them, with their covariances."""
-        held = small_gicp().PointCloud(self.points)
-        tree = small_gicp().KdTree(held)
-        small_gicp().estimate_normals_covariances(held, tree, COVARIANCE_NEIGHBOURS, self.threads)
-        return held, tree
-
-    @cached_property
-    def _padded(self) -> tuple[Float[Array, "r 3"], Neighbours]:
-        """Points and neighbours in units of a cell, in as many rows as a program is compiled for."""
-        rows = rows_for(len(self))
-        points = np.zeros((rows, 3), np.float32)
-        points[: len(self)] = self.points / self.voxel_size
-        index = np.zeros((rows, self.count), np.int32)
-        squared = np.full((rows, self.count), np.inf, np.float32)
-        index[: len(self)] = self.neighbours.rows
-        squared[: len(self)] = self.neighbours.squared / self.voxel_size**2
-        return jnp.asarray(points), Neighbours(jnp.asarray(index), jnp.asarray(squared))
+    def _padded(self, neighbours: Neighbours) -> tuple[Array, Array, Neighbours]:
+        """Points, normals and neighbours in units of a cell, in as many rows as a program is compiled for."""
+        n, rows = len(self), rows_for(len(self))
+        points, normals = np.zeros((2, rows, 3), np.float32)
+        points[:n], normals[:n] = self.points / self.voxel_size, self.normals
+        index = np.zeros((rows, NEIGHBOURS), np.int32)
+        squared = np.full((rows, NEIGHBOURS), np.inf, np.float32)
+        index[:n], squared[:n] = neighbours.rows, neighbours.squared / self.voxel_size**2
+        return jnp.asarray(points), jnp.asarray(normals), Neighbours(jnp.asarray(index), jnp.asarray(squared))

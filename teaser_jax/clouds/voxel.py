@@ -13,6 +13,7 @@ MOST_CELLS = 1 << 20  # along one axis, each way: what the library can number
 ASKED = 2000  # points whose nearest neighbour tells how densely a cloud is sampled
 NEAR_ENOUGH = 0.03  # of the number of cells that is wanted
 ROUNDS = 12
+POINTS_A_CELL = 3  # at the least, or normals mean nothing
 
 
 def downsample(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Float[np.ndarray, "m 3"]:
@@ -43,12 +44,13 @@ def count_cells(points: Float[np.ndarray, "n 3"], voxel_size: float) -> int:
     return 1 + int(np.count_nonzero(number[1:] != number[:-1]))
 
 
-def spacing(points: Float[np.ndarray, "n 3"], threads: int = 1) -> float:
+def spacing(tree: Tree) -> float:
     """Find the usual distance between a point and its nearest neighbour [length]; 0 of a single point."""
+    points = tree.points
     if len(points) < 2:
         return 0.0
     some = points[:: max(1, len(points) // ASKED)]
-    return float(np.sqrt(np.median(Tree(points, threads).neighbours(some, 2).squared[:, 1])))
+    return float(np.sqrt(np.median(tree.neighbours(some, 2).squared[:, 1])))
 
 
 def voxel_size_for(points: Float[np.ndarray, "n 3"], count: int) -> float:
@@ -73,25 +75,3 @@ def voxel_size_for(points: Float[np.ndarray, "n 3"], count: int) -> float:
         step = size * (count / cells) ** (1 / np.clip(power, -4, -0.5))
         size = step if low < step < high else float(np.sqrt(low * high))
     return float(size)
-
-
-# Of the sampling: cells finer than this hold one point each, and normals mean nothing.
-LEAST_SPACINGS = 1.6
-POINTS_A_CELL = 3
-
-
-def voxel_size_for_both(
-    src: Float[np.ndarray, "n 3"], dst: Float[np.ndarray, "m 3"], count: int, most: int
-) -> float:
-    """Choose the width of cells for two clouds, without a parameter of the user [length].
-
-    The cloud that needs finer cells gets about ``count`` of them, three points each, so that a map costs a
-    scan none of its details; neither gets more than ``most``, and none is finer than the sampling of either.
-    """
-    clouds = (src, dst)
-    size = min(voxel_size_for(x, min(count, len(x) // POINTS_A_CELL)) for x in clouds)
-    size = max(size, *(LEAST_SPACINGS * spacing(x) for x in clouds))
-    for x in clouds:
-        if count_cells(x, size) > most:
-            size = max(size, voxel_size_for(x, most))
-    return size

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from teaser_jax.clouds.neighbours import Neighbours
-from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.arrays import AnyArray, Number
 
 BINS = 11  # of each angle
 ROWS_AT_ONCE = 512  # points whose neighbours are held in memory side by side
@@ -33,8 +33,8 @@ class Descriptors(NamedTuple):
         valid: Which points have surroundings at all.
     """
 
-    values: Float[Array, "n d"]
-    valid: Bool[Array, " n"]
+    values: Float[AnyArray, "n d"]
+    valid: Bool[AnyArray, " n"]
 
 
 @partial(jax.jit, static_argnames="orientation")

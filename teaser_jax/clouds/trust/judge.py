@@ -8,17 +8,18 @@ how much of the fit is explained by no other pose.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.clouds.fine import align
-from teaser_jax.clouds.surface import FEW_NEIGHBOURS, Surface
+from teaser_jax.clouds.pair import Pair
+from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.observability import Observability, observability
-from teaser_jax.clouds.trust.pairing import both_ways, moved
-from teaser_jax.clouds.trust.rivals import Rivals, find_rivals
-from teaser_jax.clouds.voxel import downsample, voxel_size_for_both
+from teaser_jax.clouds.trust.pairing import both_ways
+from teaser_jax.clouds.trust.rivals import Guess, Rivals, find_rivals
 from teaser_jax.solution import Status
 
 CELLS, MOST_CELLS = 6000, 10**9  # of the smaller cloud; a map may have as many as it needs
@@ -34,6 +35,8 @@ MOST_EQUAL, MOST_OF_FIT = 0.80, 0.82
 # Where the pose is so far ahead of all others, it counts whatever they reach: with a cupboard in a box room
 # it is 0.13 ahead, in a corridor one door further on, or on stairs a step, 0.08 at most.
 ENOUGH_LEAD, MOST_AGAINST, GOOD_FIT = 0.10, 0.20, 0.60
+# A pose is off by less than so many expected displacements: bent fragments by two and a half.
+SURELY = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +49,7 @@ class Evidence:
         fit, fine_fit: Which part of the overlap fits, every direction of normals counting the same, the
             smaller of both ways [-]; at the finer width, too.
         overlap: Which part of either cloud lies in the overlap, the smaller one [-].
+        support: Which part of either cloud fits, the smaller one [-].
         residual: How far the surfaces lie apart along their normals [length].
         seen: Which motions the normals see.
         rivals: What other poses explain.
@@ -57,6 +61,7 @@ class Evidence:
     fit: float
     fine_fit: float
     overlap: float
+    support: float
     residual: float
     seen: Observability
     rivals: Rivals
@@ -72,91 +77,128 @@ class Evidence:
         return self.seen.displacement(self.residual)
 
 
+Doubt: TypeAlias = Literal["matches", "cells", "fit", "free", "rival", "own", "tolerance"]
+
+
+class Verdict(NamedTuple):
+    """Whether to trust a pose, and which question it failed; None: none.
+
+    "matches": there is no pose, as no points look alike; "cells": too few of them fit; "fit": too small a
+    part of the overlap; "free": a motion that the normals do not see; "rival": another pose explains as much;
+    "own": too little is explained by this pose alone; "tolerance": it holds, and less precisely than asked
+    for.
+    """
+
+    status: Status
+    doubt: Doubt | None
+
+
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A pose, aligned once more, and what is known of it."""
+    """A pose between the middles of two clouds, aligned once more, and what is known of it."""
 
     pose: Float[np.ndarray, "4 4"]
     evidence: Evidence
-    status: Status
+    verdict: Verdict
 
 
 def judge(
     pose: Float[np.ndarray, "4 4"],
-    src: Float[np.ndarray, "n 3"],
-    dst: Float[np.ndarray, "m 3"],
+    pair: Pair,
     others: Sequence[Float[np.ndarray, "4 4"]] = (),
-    threads: int = 1,
+    *,
+    guess: Guess | None = None,
+    refine: str | None = "gicp",
+    tolerance: float | None = None,
 ) -> Judged:
     """Judge a pose by the two clouds alone.
 
     Args:
-        pose: From the source to the target frame, as the points stand here.
-        src, dst: About their middles, nothing repeated and no strays [length].
+        pose: From the source to the target, each about its middle.
+        pair: The clouds.
         others: Further candidates: if one is another pose and fits as well, the answer is ambiguous.
-        threads: How many threads to ask neighbours with.
+        guess: What was known before; where the fit is good, other poses that contradict it are no rivals.
+        refine: How to align the pose at the finer cells: "gicp", "plane", or None for not at all.
+        tolerance: How far points of the overlap may be off [length]; None: two cells.
     """
-    size = voxel_size_for_both(src, dst, CELLS, MOST_CELLS)
-    near_dst = _around(dst, moved(pose, src), size)
-    near_src = _around(src, moved(np.linalg.inv(pose), near_dst), size)
-    a, b = (
-        Surface(downsample(x, size), size, threads=threads, count=FEW_NEIGHBOURS)
-        for x in (near_src, near_dst)
-    )
-    pose = align(pose, a, b)
-    here, back = both_ways(pose, a, b)
-    seen = observability(here)
+    a, b = pair.surfaces_near(pose, CELLS, MOST_CELLS)
+    with pair.timed("alignment"):
+        pose = pose if refine is None else align(pose, a, b)
+    with pair.timed("verdict"):
+        here, back = both_ways(pose, a, b)
+        seen = observability(here)
+        rivals = find_rivals(pose, a, b, here, seen, others)
     chosen = here.fits & (here.weight > 0)
     residual = 1.4826 * float(np.median(np.abs(here.residual[chosen]))) if chosen.any() else np.inf
-    fine_size, fine_fit = _at_finer_cells(pose, near_src, near_dst, size, threads)
-    fit = min(here.fit, back.fit)
+    finer = _at_finer_cells(pose, pair, a, b, refine)
     evidence = Evidence(
-        voxel_size=size,
-        fine_voxel_size=fine_size,
+        voxel_size=b.voxel_size,
+        fine_voxel_size=finer.voxel_size,
         cells=min(here.count, back.count),
-        fit=fit,
-        fine_fit=fit if fine_fit is None else fine_fit,
+        fit=min(here.fit, back.fit),
+        fine_fit=finer.fit,
         overlap=min(here.overlap, back.overlap),
+        support=min(here.support, back.support),
         residual=residual,
         seen=seen,
-        rivals=find_rivals(pose, a, b, here, seen, others),
+        rivals=rivals,
     )
-    return Judged(pose, evidence, status_of(evidence))
+    verdict = verdict_of(evidence, tolerance)
+    if guess is not None and evidence.fit >= GOOD_FIT and verdict.doubt in ("rival", "own"):
+        with pair.timed("verdict"):
+            fewer = find_rivals(pose, a, b, here, seen, others, guess)
+        evidence = replace(evidence, rivals=fewer)
+        verdict = verdict_of(evidence, tolerance)
+    return Judged(finer.pose, evidence, verdict)
 
 
-def status_of(evidence: Evidence) -> Status:
-    """Give the verdict: the first question that the evidence fails, or OK."""
+def verdict_of(evidence: Evidence, tolerance: float | None = None) -> Verdict:
+    """Give the verdict: OK, or the first question that the evidence fails.
+
+    Args:
+        evidence: What is known of the pose.
+        tolerance: How far points of the overlap may be off [length]; None: two cells.
+    """
     e = evidence
-    if e.cells < FEWEST_CELLS or e.fit < LEAST_FIT or e.fine_fit < LEAST_FINE_FIT:
-        return Status.NO_CONSENSUS
+    if e.cells < FEWEST_CELLS:
+        return Verdict(Status.NO_CONSENSUS, "cells")
+    if e.fit < LEAST_FIT or e.fine_fit < LEAST_FINE_FIT:
+        return Verdict(Status.NO_CONSENSUS, "fit")
     if e.seen.visible[0] < LEAST_VISIBLE:
-        return Status.DEGENERATE
+        return Verdict(Status.DEGENERATE, "free")
     ahead = e.rivals.lead.share >= ENOUGH_LEAD and e.rivals.lead.against <= MOST_AGAINST
-    if ahead and e.fit >= GOOD_FIT:
-        return Status.OK
-    if e.rivals.equal > MOST_EQUAL or e.rivals.fit > MOST_OF_FIT * e.fit:
-        return Status.AMBIGUOUS
-    return Status.OK if e.own >= LEAST_OWN else Status.NO_CONSENSUS
+    if not (ahead and e.fit >= GOOD_FIT):
+        if e.rivals.equal > MOST_EQUAL or e.rivals.fit > MOST_OF_FIT * e.fit:
+            return Verdict(Status.AMBIGUOUS, "rival")
+        if e.own < LEAST_OWN:
+            return Verdict(Status.NO_CONSENSUS, "own")
+    if tolerance is not None and SURELY * e.displacement > tolerance:
+        return Verdict(Status.DEGENERATE, "tolerance")
+    return Verdict(Status.OK, None)
 
 
-def _around(
-    points: Float[np.ndarray, "n 3"], part: Float[np.ndarray, "m 3"], cell: float
-) -> Float[np.ndarray, "k 3"]:
-    """Cut out of a map what lies around a part of it; where that is more than half of it, leave it whole."""
-    low, high = part.min(axis=0), part.max(axis=0)
-    margin = 10 * cell + 0.1 * (high - low).max()
-    inside = ((points > low - margin) & (points < high + margin)).all(axis=1)
-    return points[inside] if 20 < np.count_nonzero(inside) < len(points) / 2 else points
+class _Finer(NamedTuple):
+    """What the finer cells say."""
+
+    pose: Float[np.ndarray, "4 4"]
+    voxel_size: float
+    fit: float
 
 
 def _at_finer_cells(
-    pose: Float[np.ndarray, "4 4"], src: Float[np.ndarray, "n 3"], dst: Float[np.ndarray, "m 3"],
-    size: float, threads: int,
-) -> tuple[float, float | None]:  # fmt: skip
-    """Look once more at the finest cells that both samplings carry: their width, and the fit there."""
-    fine = voxel_size_for_both(src, dst, FINE_CELLS, MOST_FINE_CELLS)
-    if fine >= FINER * size:
-        return size, None
-    a, b = (Surface(downsample(x, fine), fine, threads=threads, count=FEW_NEIGHBOURS) for x in (src, dst))
-    here, back = both_ways(align(pose, a, b), a, b)
-    return fine, min(here.fit, back.fit)
+    pose: Float[np.ndarray, "4 4"], pair: Pair, src: Surface, dst: Surface, refine: str | None
+) -> _Finer:
+    """Look once more at the finest cells that both samplings carry, and keep the better of two poses there.
+
+    Alignment can end further off than it began, as where a fragment is bent.
+    """
+    a, b = src, dst
+    if pair.width(FINE_CELLS, MOST_FINE_CELLS) < FINER * dst.voxel_size:
+        a, b = pair.surfaces_near(pose, FINE_CELLS, MOST_FINE_CELLS)
+    with pair.timed("alignment"):
+        before = min(x.fit for x in both_ways(pose, a, b))
+        if refine is None:
+            return _Finer(pose, b.voxel_size, before)
+        other = align(pose, a, b, method=refine)
+        after = min(x.fit for x in both_ways(other, a, b))
+    return _Finer(other, b.voxel_size, after) if after >= before else _Finer(pose, b.voxel_size, before)

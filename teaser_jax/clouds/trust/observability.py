@@ -7,11 +7,36 @@ normals that it crosses, in units of how far it displaces the points.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.clouds.trust.pairing import Pairing
+
+MOSTLY_SHIFT = 0.5  # of the squared displacement: then a motion is called a slide
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion that leaves what is seen as it is.
+
+    Attributes:
+        kind: "slide" along the axis, or "turn" about it.
+        axis: Unit vector in the target frame.
+        point: A point of the axis, in the target frame [length].
+    """
+
+    kind: Literal["slide", "turn"]
+    axis: Float[np.ndarray, "3"]
+    point: Float[np.ndarray, "3"]
+
+    def __str__(self) -> str:
+        """Say in words how it moves."""
+        axis = ", ".join(f"{x:.2f}" for x in self.axis)
+        if self.kind == "slide":
+            return f"slides along ({axis})"
+        return f"turns about ({axis}) through ({', '.join(f'{x:.4g}' for x in self.point)})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +58,20 @@ class Observability:
     def displacement(self, residual: float) -> float:
         """Compute how far points of the overlap may be off where surfaces lie ``residual`` apart [length]."""
         return float(residual * np.sqrt(np.mean(1 / np.maximum(self.visible, 1e-9))))
+
+    def covariance(self, residual: float) -> Float[np.ndarray, "6 6"]:
+        """Compute the covariance of a small shift of the centroid and a small turn about it [length, rad].
+
+        It is so large that points of the overlap are off by ``displacement(residual)``, root mean square.
+        """
+        return residual**2 / 6 * (self.motions / np.maximum(self.visible, 1e-9)) @ self.motions.T
+
+    def free(self, least: float) -> tuple[Motion, ...]:
+        """List the motions of which the normals see less than a share: slides first, then turns."""
+        free = self.motions[:, self.visible < least]
+        # On a plane any mixture of two slides and a turn is free: those with the least turn are taken apart.
+        mixture = np.linalg.svd(free[3:], full_matrices=True)[2]
+        return tuple(_motion(m, self.centroid) for m in (free @ mixture.T).T[::-1])
 
 
 def observability(pairing: Pairing) -> Observability:
@@ -63,3 +102,16 @@ def observability(pairing: Pairing) -> Observability:
     motions = root @ motions
     motions[3:] /= size
     return Observability(np.maximum(visible, 0), motions, centroid)
+
+
+def _motion(motion: Float[np.ndarray, "6"], centroid: Float[np.ndarray, "3"]) -> Motion:
+    """Tell a small motion, a shift of the centroid and a turn about it, as a slide or as a turn.
+
+    Its points are displaced by one on average (root mean square), by the shift and by the turn together.
+    """
+    shift, turn = motion[:3], motion[3:]
+    if np.linalg.norm(shift) ** 2 > MOSTLY_SHIFT:
+        return Motion("slide", shift / np.linalg.norm(shift), centroid)
+    rate = np.linalg.norm(turn)
+    axis = turn / rate
+    return Motion("turn", axis, centroid + np.cross(axis, shift) / rate)

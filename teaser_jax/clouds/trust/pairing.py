@@ -63,6 +63,11 @@ class Pairing:
         """Which part of the surface lies in the overlap [-]."""
         return float(np.mean(self.near))
 
+    @property
+    def support(self) -> float:
+        """Which part of the surface fits [-]."""
+        return float(np.mean(self.fits))
+
 
 def pair(
     pose: Float[np.ndarray, "4 4"], src: Surface, dst: Surface, rows: Int[np.ndarray, " m"] | None = None
@@ -83,7 +88,7 @@ def _compared(
     there: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], dst: Surface
 ) -> tuple[np.ndarray, ...]:
     """Compare cells with the nearest ones of a surface: which, their normals, how far, and what fits."""
-    partner, distance = dst.tree.nearest(there)
+    partner, distance = dst.tree.nearest(there, NEAR * dst.voxel_size)
     theirs = dst.normals[partner]
     cosine = np.sum(across * theirs, axis=1)
     theirs = np.where((cosine < 0)[:, None], -theirs, theirs)

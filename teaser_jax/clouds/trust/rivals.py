@@ -42,6 +42,18 @@ class Rivals(NamedTuple):
     poses: tuple[Float[np.ndarray, "4 4"], ...]
 
 
+class Guess(NamedTuple):
+    """What is known of a pose beforehand.
+
+    Attributes:
+        pose: Between the middles of the clouds.
+        error: How far points of the overlap may be off [length].
+    """
+
+    pose: Float[np.ndarray, "4 4"]
+    error: float
+
+
 NONE = Rivals(0.0, 0.0, Lead(1.0, 0.0), ())
 
 
@@ -52,6 +64,7 @@ def find_rivals(
     here: Pairing,
     seen: Observability,
     others: Sequence[Float[np.ndarray, "4 4"]] = (),
+    guess: Guess | None = None,
 ) -> Rivals:
     """Look for other poses in which the fitting cells fit as well.
 
@@ -61,6 +74,7 @@ def find_rivals(
         here: The source laid onto the target by the pose.
         seen: Which motions the normals see there.
         others: Further candidates.
+        guess: What was known beforehand: a pose that contradicts it is no rival.
     """
     chosen = np.flatnonzero(here.fits & (here.weight > 0))
     if len(chosen) < 20:
@@ -77,6 +91,10 @@ def find_rivals(
     some = points[:: max(1, len(points) // 500)]
     apart = lambda motion: np.linalg.norm(moved(motion, some) - some, axis=1).mean()
     motions = motions[[apart(motion) >= DIFFERENT * cell for motion in motions]]
+    if guess is not None:
+        back = guess.pose @ np.linalg.inv(pose)  # to where the guess has the points
+        astray = lambda motion: np.linalg.norm(moved(motion, some) - moved(back, some), axis=1).mean()
+        motions = motions[[astray(motion) <= guess.error for motion in motions]]
     if len(motions) == 0:
         return NONE
     quick = _screened(motions @ pose, src, dst, asked)

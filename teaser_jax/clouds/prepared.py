@@ -1,0 +1,121 @@
+"""A cloud that is used more than once: what was found of it at each width of cells is kept."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from teaser_jax.clouds.cloud import Cloud, as_cloud
+from teaser_jax.clouds.neighbours import Tree
+from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.voxel import POINTS_A_CELL, downsample, spacing, voxel_size_for
+from teaser_jax.ground.checks import whole_number
+
+STEPS = 4  # widths of cells that a kept cloud is cut into, between one and twice as wide
+LADDER_CELLS = 6000  # of the step that all others are counted from
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A cloud with what was found of it, so that nothing is computed twice.
+
+    Attributes:
+        cloud: Its points.
+        threads: How many threads to ask neighbours with.
+        is_kept: Whether it meets other clouds, too: then it is cut at few widths of cells, and all are kept.
+    """
+
+    cloud: Cloud
+    threads: int = 1
+    is_kept: bool = False
+    _widths: dict[int, float] = field(default_factory=dict)
+    _surfaces: dict[float, Surface] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Prepared({self.cloud!r})"
+
+    def __len__(self) -> int:
+        return len(self.cloud)
+
+    @cached_property
+    def tree(self) -> Tree:
+        """The points, to ask for the nearest."""
+        return Tree(self.cloud.points, self.threads)
+
+    @cached_property
+    def spacing(self) -> float:
+        """The usual distance between neighbouring points [length]."""
+        return spacing(self.tree)
+
+    def width_for(self, cells: int) -> float:
+        """Find the width of cells that leaves about so many [length]."""
+        if cells not in self._widths:
+            self._widths[cells] = voxel_size_for(self.cloud.points, cells)
+        return self._widths[cells]
+
+    def next_step(self, width: float) -> float:
+        """Find the next width, not below this one, that a kept cloud is cut at [length]."""
+        first = self.width_for(min(LADDER_CELLS, len(self) // POINTS_A_CELL))
+        return float(first * 2 ** (np.ceil(STEPS * np.log2(width / first) - 1e-9) / STEPS))
+
+    def surface(self, width: float) -> Surface:
+        """Cut the cloud into cells of a width."""
+        if width not in self._surfaces:
+            points = downsample(self.cloud.points, width)
+            self._surfaces[width] = Surface(points, width, self.cloud.viewpoint, self.threads)
+        return self._surfaces[width]
+
+    def scaled(self, scale: float) -> Prepared:
+        """Make the cloud larger by a factor; 1 leaves it as it is, with all that is known of it."""
+        if scale == 1:
+            return self
+        c = self.cloud
+        eye = None if c.viewpoint is None else scale * c.viewpoint
+        larger = replace(c, points=scale * c.points, origin=scale * c.origin, viewpoint=eye)
+        return Prepared(larger, self.threads, self.is_kept)
+
+
+def prepare(
+    cloud: Any,
+    *,
+    viewpoint: Any = None,
+    crop: Any = None,
+    max_range: float | None = None,
+    threads: int | None = None,
+    name: str = "cloud",
+) -> Prepared:
+    """Read a cloud once, to register it with many others: a map with each scan that comes.
+
+    What is found of it, as its normals and descriptors, is kept and taken again. So that this can be, it is
+    cut into cells of few widths; answers differ from those of an unprepared cloud within their accuracy.
+
+    Args:
+        cloud: (n, 3) points: an array, a structured one with fields x, y, z, a cloud of Open3D, or the path
+            of a file. What cannot be used (NaN, zeros, strays, repetitions) is left out and counted.
+        viewpoint: Where the sensor stood, (3,), in the frame of the cloud [length].
+        crop: The lower and the upper corner of a box, (2, 3); points outside are left out [length].
+        max_range: Points further away from the viewpoint are left out; from the origin if there is none
+            [length].
+        threads: How many threads to work with; None: as many as there are cores. They change no answer.
+        name: What to call the cloud in errors.
+
+    Returns:
+        A ``Prepared``, which ``register_clouds`` takes in the place of either cloud.
+
+    Raises:
+        ValueError: If it cannot be read, or has fewer than 100 points that can be used.
+        ImportError: Without the extra ``clouds``.
+    """
+    read = as_cloud(cloud, name, viewpoint=viewpoint, crop=crop, max_range=max_range)
+    return Prepared(read, threads_or_all(threads), is_kept=True)
+
+
+def threads_or_all(threads: int | None) -> int:
+    """Read a number of threads; None: as many as there are cores for this process."""
+    if threads is not None:
+        return whole_number("threads", threads, 1, what="how many threads to work with")
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
