@@ -63,7 +63,7 @@ class Tree:
     def in_reach(self, asked: Float[np.ndarray, "m 3"], within: float) -> Bool[np.ndarray, " m"]:
         """Tell which points lie in the box around these, or not much outside."""
         low, high = self.box
-        return ((asked >= low - within) & (asked <= high + within)).all(axis=1)
+        return np.all((asked >= low - within) & (asked <= high + within), axis=1)
 
     @cached_property
     def box(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:

@@ -75,8 +75,8 @@ def register_clouds(
         initial_error: How far it may have points of the overlap off [length]; other poses further off are
             not counted as rivals then. None: three cells, and no pose is ruled out.
         scale: Known scale, by which the target sees the source larger [-].
-        descriptors: Two arrays, (n, d) and (m, d): for each point of the source and of the target, as given, a
-            row of numbers, of which near ones look alike; None: histograms of the normals around (FPFH).
+        descriptors: Two arrays, (n, d) and (m, d): for each point of the source and of the target, as given,
+            a row of numbers, of which near ones look alike; None: histograms of the normals around (FPFH).
         crop: The lower and the upper corner of a box in the frame of each cloud, (2, 3) [length].
         max_range: Points further from the viewpoint, or the origin, are left out [length].
         threads: How many threads to work with; None: one for each core. They change no answer.
