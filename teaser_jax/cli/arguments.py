@@ -14,6 +14,7 @@ CLIQUES = ("exact", "greedy", "networkx", "none")
 ROTATIONS = ("gnc", "global", "sdp")
 TIM_GRAPHS = ("chain", "complete")
 VOTES = ("tls", "consensus")
+REFINEMENTS = ("gicp", "plane", "none")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -29,12 +30,12 @@ def parser() -> argparse.ArgumentParser:
     """Make the parser of the command line; ``command`` of what it returns names the module that runs."""
     program = _Parser(
         prog="teaser-jax",
-        description="Robust registration of matched 3-D points.",
+        description="Robust registration of 3-D points: of two raw clouds, or of matches.",
         epilog="Exit codes: 0 ok, 1 no trustworthy answer (the status says why), 2 bad input.",
     )
     program.add_argument("--version", action="version", version=f"teaser-jax {__version__}")
     commands = program.add_subparsers(required=True, metavar="COMMAND", dest="command")
-    _add_register(commands.add_parser("register", help="find the pose behind a file of matches"))
+    _add_register(commands.add_parser("register", help="find the pose between two clouds, or behind matches"))
     _add_demo(
         commands.add_parser("demo", help="register 1000 matches of which 950 are wrong, and draw the answer")
     )
@@ -46,28 +47,15 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_register(register: argparse.ArgumentParser) -> None:
     register.add_argument(
-        "matches", metavar="MATCHES", type=Path,
-        help=".npz with arrays src and dst, maybe also noise_bound, scale, cbar2, mask, confidence, pairs; "
-        "or .npy, text or CSV with six columns",
-    )  # fmt: skip
-    # Options that are not given stay absent: then the file speaks, then the defaults of tj.register.
-    absent = argparse.SUPPRESS
-    register.add_argument(
-        "--noise-bound", type=float, default=absent, metavar="B",
-        help="largest error of a right match, in the unit of the points (default: noise_bound in the file)",
+        "source", metavar="FILE", type=Path,
+        help="a cloud (.ply, .pcd, .xyz, .txt, .csv, .npy, .npz, .bin, .las, .laz, .e57, .stl, .obj, .off, "
+        ".mat), if a second one follows; alone, a file of matches: .npz with arrays src and dst, maybe also "
+        "noise_bound, scale, cbar2, mask, confidence, pairs; or .npy, text or CSV with six columns",
     )  # fmt: skip
     register.add_argument(
-        "--scale", type=_scale, default=absent, metavar="S|estimate",
-        help="the known scale (default: scale in the file, or 1), or the word estimate",
+        "target", metavar="TARGET", type=Path, nargs="?",
+        help="the cloud in whose frame the pose brings the first one",
     )  # fmt: skip
-    register.add_argument(
-        "--cbar2", type=float, default=absent, metavar="C",
-        help="truncation of the cost (default: cbar2 in the file, or 1)",
-    )  # fmt: skip
-    _add_settings(register)
-    register.add_argument(
-        "--certify", action="store_true", help="prove how good the rotation is, and say so in the answer"
-    )
     register.add_argument("--json", action="store_true", help="print the answer as JSON")
     register.add_argument(
         "--plot", type=_picture, metavar="PNG",
@@ -77,9 +65,74 @@ def _add_register(register: argparse.ArgumentParser) -> None:
         "-o", "--output", type=_output, metavar="TXT",
         help="write T_dst_src, 4 x 4; if the answer cannot be trusted, an older file is removed instead",
     )  # fmt: skip
+    # Options that are not given stay absent: then the file speaks, then the defaults of the function.
+    register.add_argument(
+        "--scale", type=_scale, default=argparse.SUPPRESS, metavar="S|estimate",
+        help="the known scale (default: scale in the file of matches, or 1); of matches also the word estimate",
+    )  # fmt: skip
+    _add_matches(register.add_argument_group("of matches"))
+    _add_clouds(register.add_argument_group("of two clouds"))
 
 
-def _add_settings(register: argparse.ArgumentParser) -> None:
+def _add_clouds(register: argparse._ArgumentGroup) -> None:
+    absent = argparse.SUPPRESS
+    for name, metavar, text in (
+        ("voxel-size", "V", "width of the cells that the verdict rests on (default: chosen from both clouds)"),
+        ("tolerance", "L", "how far points of the overlap may be off at the most (default: two voxels)"),
+        ("initial-error", "L", "how far the initial pose may have points of the overlap off"),
+        ("max-range", "L", "leave out points further from the viewpoint, or the origin"),
+        ("seconds", "S", "try no further way to match after so many seconds"),
+    ):
+        register.add_argument(f"--{name}", type=float, default=absent, metavar=metavar, help=text)
+    for name in ("src", "dst"):
+        register.add_argument(
+            f"--{name}-viewpoint", type=float, nargs=3, default=absent, metavar=("X", "Y", "Z"),
+            help=f"where the sensor of the {'first' if name == 'src' else 'second'} cloud stood, in its frame",
+        )  # fmt: skip
+    register.add_argument(
+        "--initial", type=Path, default=absent, metavar="TXT",
+        help="a file with a pose near the answer, 4 x 4: only poses near it are looked for",
+    )  # fmt: skip
+    register.add_argument(
+        "--crop", type=float, nargs=6, default=absent, metavar=("X", "Y", "Z", "X2", "Y2", "Z2"),
+        help="leave out points outside this box, in the frame of each cloud",
+    )  # fmt: skip
+    register.add_argument(
+        "--threads", type=int, default=absent, metavar="N",
+        help="how many threads to work with; they change no answer (default: one for each core)",
+    )  # fmt: skip
+    register.add_argument(
+        "--refine", choices=REFINEMENTS, default=absent,
+        help="how to align at last: by the shape of both clouds, by planes of the second (default: gicp)",
+    )  # fmt: skip
+    register.add_argument(
+        "--html", type=_page, default=absent, metavar="HTML",
+        help="write a page to turn and look at the answer from all sides",
+    )  # fmt: skip
+    register.add_argument(
+        "--merged", type=_merged, default=absent, metavar="PLY",
+        help="write both clouds in the frame of the second, with their colours and intensity",
+    )  # fmt: skip
+
+
+def _add_matches(register: argparse._ArgumentGroup) -> None:
+    absent = argparse.SUPPRESS
+    register.add_argument(
+        "--noise-bound", type=float, default=absent, metavar="B",
+        help="largest error of a right match, in the unit of the points (default: noise_bound in the file)",
+    )  # fmt: skip
+    register.add_argument(
+        "--cbar2", type=float, default=absent, metavar="C",
+        help="truncation of the cost (default: cbar2 in the file, or 1)",
+    )  # fmt: skip
+    _add_settings(register)
+    register.add_argument(
+        "--certify", action="store_true", default=absent,
+        help="prove how good the rotation is, and say so in the answer",
+    )  # fmt: skip
+
+
+def _add_settings(register: argparse._ArgumentGroup) -> None:
     absent = argparse.SUPPRESS
     register.add_argument(
         "--clique", choices=CLIQUES, default=absent, help="how to prune wrong matches (default: exact)"
@@ -174,4 +227,19 @@ def _picture(text: str) -> Path:
     if path.suffix.lower() not in PICTURES:
         kinds = ", ".join(PICTURES[:-1])
         raise argparse.ArgumentTypeError(f"{text}: unknown kind of picture: end the name in one of {kinds}")
+    return path
+
+
+def _page(text: str) -> Path:
+    return _ending(text, ".html", "a page")
+
+
+def _merged(text: str) -> Path:
+    return _ending(text, ".ply", "a merged cloud")
+
+
+def _ending(text: str, suffix: str, what: str) -> Path:
+    path = _output(text)
+    if path.suffix.lower() != suffix:
+        raise argparse.ArgumentTypeError(f"{text}: end the name of {what} in {suffix}")
     return path

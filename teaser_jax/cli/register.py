@@ -1,4 +1,4 @@
-"""``teaser-jax register``: from a file of matches to a pose, a picture, and words about both."""
+"""``teaser-jax register MATCHES``: from a file of matches to a pose, a picture, and words about both."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import teaser_jax as tj
+from teaser_jax.cli import clouds
+from teaser_jax.cli.clouds import CLOUDS_ONLY, check_kind
 from teaser_jax.cli.endings import OK, UNTRUSTED, BadInput
 from teaser_jax.cli.places import check_places, draw, failures_named, writing
 from teaser_jax.cli.report import as_plain_data, errors_as_text
@@ -24,13 +26,16 @@ BUDGETS = {"clique_seconds": "seconds", "clique_nodes": "nodes"}  # of ExactCliq
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Register the matches of a file, write what is asked for, print the answer, and return the exit code.
+    """Register the matches of a file, or two clouds, write what is asked for, and return the exit code.
 
     Raises:
         BadInput: If something cannot be read, solved or written; then no file has changed.
-        FileError: If the file of matches cannot be used.
+        FileError: If a file cannot be used.
     """
-    source, output, plot = arguments.matches, arguments.output, arguments.plot
+    if arguments.target is not None:
+        return clouds.run(arguments)
+    check_kind(arguments, CLOUDS_ONLY, "two clouds")
+    source, output, plot = arguments.source, arguments.output, arguments.plot
     check_places(source, output, plot)
     matches = read_matches(source)
     for sentence in matches.ignored:
@@ -43,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     start = time.perf_counter()
     settings = _settings(given)
-    result = _answer(source, matches, settings, known | {"certify": arguments.certify})
+    result = _answer(source, matches, settings, known | {"certify": given.get("certify", False)})
     seconds = time.perf_counter() - start
 
     older = output is not None and output.exists()

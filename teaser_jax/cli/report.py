@@ -1,4 +1,4 @@
-"""The answer of ``teaser-jax register`` as JSON, and its errors where the truth is known."""
+"""The answers of ``teaser-jax register`` as JSON, and their errors where the truth is known."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from teaser_jax import metrics
+from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
 from teaser_jax.pose import Pose
 from teaser_jax.register import Registration
@@ -32,18 +33,12 @@ def as_plain_data(result: Registration, truth: Pose | None, seconds: float) -> d
         truth: The pose to compare with, or None.
         seconds: How long it took.
     """
-    pose, solution = result.pose, result.solution
+    solution = result.solution
     report = {
         "ok": result.ok,
         "status": result.status.name,
         "advice": result.advice,
-        "pose": {
-            "scale": _plain(pose.scale),
-            "rotation": _plain(pose.rotation),
-            "quaternion_xyzw": _plain(pose.quat),
-            "translation": _plain(pose.translation),
-            "T_dst_src": _plain(pose.matrix),
-        },
+        "pose": _pose(result.pose),
         "matches": len(result.inliers),
         "excluded": int(solution.excluded),
         "inliers": np.flatnonzero(result.inliers).tolist(),
@@ -58,13 +53,68 @@ def as_plain_data(result: Registration, truth: Pose | None, seconds: float) -> d
     if result.has_certificate:
         report["certificate"] = _certificate(result.certificate)
     if truth is not None:
-        error = metrics.errors(pose, truth)
+        error = metrics.errors(result.pose, truth)
         report["error"] = {
             "rotation_deg": _plain(error.rotation_deg),
             "translation": _plain(error.translation),
             "scale": _plain(error.scale),
         }
     return report
+
+
+def clouds_as_plain_data(result: CloudRegistration) -> dict[str, Any]:
+    """Turn an answer to two clouds into what JSON can hold; numbers that are not finite become null."""
+    report: dict[str, Any] = {
+        "ok": result.ok,
+        "status": result.status.name,
+        "doubt": result.doubt,
+        "advice": result.advice,
+        "pose": _pose(result.pose),
+        "voxel_size": _plain(result.voxel_size),
+        "displacement": _plain(result.displacement),
+        "covariance": _plain(result.covariance),
+        "centroid": _plain(result.centroid),
+        "equivalent": [_plain(pose.matrix) for pose in result.equivalent],
+        "free": [
+            {"kind": x.kind, "axis": _plain(x.axis), "point": _plain(x.point)} for x in result.free
+        ],
+        "points": {
+            name: {"given": x.given, "used": len(x), "left_out": str(x.left_out)}
+            for name, x in (("src", result.src), ("dst", result.dst))
+        },
+        "candidates": [
+            {"T_dst_src": _plain(x.pose.matrix), "fit": _plain(x.fit), "found_by": x.found_by}
+            for x in result.candidates
+        ],
+        "ended_early": result.ended_early,
+        "seconds": {name: round(value, 6) for name, value in result.seconds.items()},
+    }  # fmt: skip
+    e = result.evidence
+    if e is not None:
+        report["evidence"] = {
+            "cells": e.cells,
+            "fit": _plain(e.fit),
+            "fine_fit": _plain(e.fine_fit),
+            "fine_voxel_size": _plain(e.fine_voxel_size),
+            "overlap": _plain(e.overlap),
+            "support": _plain(e.support),
+            "residual": _plain(e.residual),
+            "visible": _plain(e.seen.visible),
+            "explained_by_another": _plain(e.rivals.equal),
+            "own": _plain(e.own),
+            "lead": _plain(e.rivals.lead.share),
+        }
+    return report
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    return {
+        "scale": _plain(pose.scale),
+        "rotation": _plain(pose.rotation),
+        "quaternion_xyzw": _plain(pose.quat),
+        "translation": _plain(pose.translation),
+        "T_dst_src": _plain(pose.matrix),
+    }
 
 
 def _certificate(found: Certificate) -> dict[str, Any]:
