@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Real
 
+from teaser_jax.ground.extras import needed
 from teaser_jax.ground.io import FileError, or_file_error, os_errors_named
 from teaser_jax.synthetic.models import Triangles
 
@@ -21,7 +22,7 @@ def read_shape(path: str | PathLike[str]) -> Real[np.ndarray, "m 3"] | Triangles
 
     Raises:
         FileError: If the file is missing or broken or holds no points.
-        ImportError: Without the extra ``studies``, for anything but ``.npy``.
+        ImportError: Without the extra ``clouds``, for anything but ``.npy``.
     """
     path = Path(path)
     if path.is_dir():
@@ -30,7 +31,7 @@ def read_shape(path: str | PathLike[str]) -> Real[np.ndarray, "m 3"] | Triangles
         raise FileError(f"{path}: no such file: give a model with triangles or points, or 'procedural'.")
     read = _by_numpy if path.suffix == ".npy" else _by_trimesh
     if read is _by_trimesh:
-        _check_trimesh()
+        needed("trimesh", "reading models needs trimesh", "clouds")
     what = "cannot be read as a model"
     # What trimesh says of a broken file speaks of its own insides.
     advice = (
@@ -45,14 +46,6 @@ def read_shape(path: str | PathLike[str]) -> Real[np.ndarray, "m 3"] | Triangles
     if not np.isfinite(points).all():
         raise FileError(f"{path}: holds points that are not finite numbers.")
     return shape
-
-
-def _check_trimesh() -> None:
-    """Raise ImportError with the name of the extra, rather than call the file broken."""
-    try:
-        import trimesh  # noqa: F401
-    except ImportError:
-        raise ImportError("reading models needs trimesh: pip install 'teaser-jax[studies]'") from None
 
 
 def _by_numpy(path: Path) -> np.ndarray:
