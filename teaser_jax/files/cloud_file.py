@@ -46,7 +46,7 @@ class CloudFile:
 
 
 def from_columns(path: Path, columns: Mapping[str, np.ndarray]) -> CloudFile:
-    """Make a cloud of columns with names: x, y, z, and those of colours and of an intensity if they are there.
+    """Make a cloud of columns with names: x, y, z, and colours and an intensity if they are there.
 
     Raises:
         FileError: If x, y or z is missing, or holds no numbers.

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from teaser_jax.reading import real_numbers
 READERS: dict[str, Callable[[Path], CloudFile]] = {
     "PLY": read_ply, "PCD": read_pcd, "text": read_text, "NPZ": read_npz, "NPY": read_npy, "MAT": read_mat,
     "KITTI": read_scan, "LAS": read_las, "E57": read_e57,
-    "STL": read_mesh, "OBJ": read_mesh, "OFF": read_mesh,
+    **{kind: partial(read_mesh, kind=kind.lower()) for kind in ("STL", "OBJ", "OFF")},
 }  # fmt: skip
 LOUD = ("trimesh", "laspy")  # libraries that log what they find odd
 ROUNDED = 1e-6  # of the extent of a cloud: what single precision may cost
@@ -38,12 +39,12 @@ ROUNDED = 1e-6  # of the extent of a cloud: what single precision may cost
 def read_cloud(path: str | PathLike[str]) -> CloudFile:
     """Read a cloud; what begins as another kind of file than its name says is read as what it is.
 
-    - ``.ply``: x, y, z of the vertices, red, green, blue and intensity, text or binary. Vertices are the cloud,
-      unless the file is clearly a model: with fewer than a thousand of them, or with most of its surface in
-      few large triangles, 100 000 points are drawn evenly from the triangles, always the same ones.
+    - ``.ply``: x, y, z of the vertices, red, green, blue and intensity, text or binary. Vertices are the
+      cloud, unless the file is clearly a model: with fewer than 5000 of them, or with most of its
+      surface in few large triangles, 100 000 points are drawn evenly from the triangles, always the same.
     - ``.pcd``: text, binary or compressed. Its viewpoint is not applied.
-    - ``.txt``, ``.csv``, ``.tsv``, ``.dat``, ``.xyz``, ``.asc``, ``.pts``: x y z in the first three columns, or in
-      columns with these names; named columns of colours and intensity are read, too.
+    - ``.txt``, ``.csv``, ``.tsv``, ``.dat``, ``.xyz``, ``.asc``, ``.pts``: x y z in the first three columns,
+      or in columns with these names; named columns of colours and intensity are read, too.
     - ``.npz``: the array ``points``, or the only one of three columns or more; ``colours`` and ``intensity``
       beside it. ``.mat`` likewise. ``.npy``: an array of three columns or more, or records with x, y, z.
     - ``.bin``: scans of KITTI, x y z and reflectance in float32; ``.pcd.bin``: those of nuScenes.
@@ -63,9 +64,9 @@ def read_cloud(path: str | PathLike[str]) -> CloudFile:
         ImportError: If the library of its kind is missing, with the line that installs it.
     """
     path = Path(path)
-    if path.is_dir():
-        raise FileError(f"{path}: is a folder: name the file of a cloud in it.")
     with os_errors_named(path, "cannot be read"):
+        if path.is_dir():
+            raise FileError(f"{path}: is a folder: name the file of a cloud in it.")
         if not path.exists():
             raise FileError(f"{path}: no such file: check the name.")
         if not path.is_file():
@@ -137,8 +138,8 @@ def write_cloud(
     words = {"<f4": "float", "<f8": "double", "<u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
     lines += [f"property {words[kind]} {name}" for name, kind, _ in columns]
-    with replacing(path) as partial:
-        partial.write_bytes("\n".join([*lines, "end_header\n"]).encode() + table.tobytes())
+    with replacing(path) as unfinished:
+        unfinished.write_bytes("\n".join([*lines, "end_header\n"]).encode() + table.tobytes())
 
 
 def _check_shape(name: str, array: Any, shape: tuple[int, ...]) -> None:

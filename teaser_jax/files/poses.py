@@ -139,9 +139,9 @@ def read_poses(path: str | PathLike[str]) -> PoseFile:
         FileError: If there is no such file, or it is broken, or holds something else.
     """
     path = Path(path)
-    if path.is_dir():
-        raise FileError(f"{path}: is a folder: name a file of poses in it.")
     with os_errors_named(path, "cannot be read"):
+        if path.is_dir():
+            raise FileError(f"{path}: is a folder: name a file of poses in it.")
         if not path.exists():
             raise FileError(f"{path}: no such file: check the name.")
         if path.suffix.lower() == ".json":

@@ -14,6 +14,7 @@ from teaser_jax.ground.io import FileError, check_unpacked, or_file_error, read_
 
 POINTS = "points"
 COLOURS, INTENSITY = ("colours", "colors", "rgb"), ("intensity", "intensities")
+SMALLEST = 5  # rows of an array that is taken for points by its shape: poses have up to four
 
 
 def read_npz(path: Path) -> CloudFile:
@@ -71,7 +72,7 @@ def read_mat(path: Path) -> CloudFile:
 
 def _among(path: Path, arrays: Mapping[str, np.ndarray], advice: str) -> CloudFile:
     """Choose the points, the colours and the intensity among arrays with names."""
-    chosen = [POINTS] if POINTS in arrays else [name for name, array in arrays.items() if _fits(array)]
+    chosen = [POINTS] if POINTS in arrays else [n for n, array in arrays.items() if _fits(array, SMALLEST)]
     extra = [name for name in chosen if name.lower() in COLOURS]
     if len(chosen) > 1 and len(chosen) - len(extra) == 1:
         chosen = [name for name in chosen if name not in extra]
@@ -102,10 +103,16 @@ def _beside(
     return None, None
 
 
-def _fits(array: np.ndarray) -> bool:
+def _fits(array: np.ndarray, rows: int = 1) -> bool:
     if array.dtype.names:
         return set("xyz") <= {name.lower() for name in array.dtype.names}
-    return array.ndim == 2 and array.shape[1] >= 3 and array.dtype.kind in "fiu" and len(array) > 0
+    shaped = array.ndim == 2 and array.shape[1] >= 3 and len(array) >= rows and not _is_turned(array)
+    return shaped and array.dtype.kind in "fiu"
+
+
+def _is_turned(array: np.ndarray) -> bool:
+    """Tell whether columns are points: there are far more of them than of coordinates."""
+    return array.ndim == 2 and len(array) in (3, 4) and array.shape[1] > 6
 
 
 def _from_array(path: Path, array: np.ndarray) -> CloudFile:
@@ -113,8 +120,7 @@ def _from_array(path: Path, array: np.ndarray) -> CloudFile:
         flat = array.reshape(-1)
         return from_columns(path, {name: flat[name] for name in array.dtype.names})
     if not _fits(array):
-        turned = array.ndim == 2 and array.shape[0] == 3
-        advice = "save its transpose" if turned else "expected (n, 3), a point a row"
+        advice = "save its transpose" if _is_turned(array) else "expected (n, 3), a point a row"
         raise FileError(f"{path}: holds an array of shape {array.shape} of {array.dtype}: {advice}.")
     more = array.shape[1] - 3
     ignored = (f"not read: the {more} column(s) behind x, y, z",) if more else ()

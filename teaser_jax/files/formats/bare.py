@@ -41,8 +41,8 @@ def read_scan(path: Path) -> CloudFile:
     size = path.stat().st_size
     if size % (4 * width):
         raise FileError(
-            f"{path}: has {size} bytes, which are no scan of {width} numbers of four bytes a point: it is cut "
-            "off, or of another kind."
+            f"{path}: has {size} bytes, which are no scan of {width} numbers of four bytes a point: it "
+            "is cut off, or of another kind."
         )
     rows = np.fromfile(path, "<f4").reshape(-1, width)
     with np.errstate(invalid="ignore"):
@@ -52,5 +52,4 @@ def read_scan(path: Path) -> CloudFile:
             f"{path}: holds no coordinates: {beyond:.0%} of its numbers, read as float32, are beyond "
             f"{FURTHEST:g}. Scans of KITTI are x y z reflectance in float32."
         )
-    # Other bytes make numbers that are next to nothing.
     return CloudFile(rows[:, :3].astype(np.float64), intensity=rows[:, 3].astype(np.float64))

@@ -1,4 +1,4 @@
-"""Clouds from meshes: STL, OBJ, OFF, and PLY with triangles. Points are drawn evenly, always the same ones."""
+"""Clouds from meshes: points are drawn evenly from triangles, and are always the same ones."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from teaser_jax.synthetic.models import Triangles, sample_triangles
 
 DRAWN = 100_000  # points
 SEED = 0
-FEWEST_VERTICES = 1000  # that can stand for a surface
+FEWEST_VERTICES = 5000  # that can stand for a surface
 EVEN = 0.1  # the share of triangles that would have the surface of all, were all as large as the large ones
 
 
-def read_mesh(path: Path) -> CloudFile:
+def read_mesh(path: Path, kind: str) -> CloudFile:
     """Draw points from the triangles of a mesh; a file without triangles is a cloud of its vertices.
 
     Raises:
         FileError: If it cannot be read, or holds neither.
         ImportError: If trimesh is missing.
     """
-    shape = read_shape(path)
+    shape = read_shape(path, kind=kind)
     return sampled(path, shape) if isinstance(shape, Triangles) else CloudFile(shape.astype(np.float64))
 
 

@@ -48,7 +48,7 @@ def read_ply(path: Path) -> CloudFile:
     """Read the vertices of a PLY file, or points drawn from its triangles if it is clearly a model.
 
     Scans that were meshed have vertices wherever they have a surface, and those are the cloud. A file is a
-    model if few large triangles make most of its surface, or if it has fewer than a thousand vertices.
+    model if few large triangles make most of its surface, or if it has fewer than 5000 vertices.
 
     Raises:
         FileError: If it is broken, or holds no vertices.
@@ -59,10 +59,10 @@ def read_ply(path: Path) -> CloudFile:
         room = path.stat().st_size - header.length
         cloud = from_columns(path, _vertices(path, file, header, room))
     faces = next((x for x in header.elements if x.name == "face" and x.rows), None)
-    if faces is None:
+    if faces is None or not np.isfinite(cloud.points).all():
         return cloud
     check_room(path, faces.rows, 2 if header.order == "" else 1, room, item="faces")
-    shape = read_shape(path)
+    shape = read_shape(path, kind="ply")
     if not isinstance(shape, Triangles) or not is_a_model(shape):
         return cloud
     lost = cloud.colours is not None or cloud.intensity is not None
