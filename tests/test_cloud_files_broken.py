@@ -61,6 +61,17 @@ def las(**changes: tuple[str, int, int]) -> bytes:
     return bytes(data)
 
 
+def laz(chunks: int) -> bytes:
+    """A LAZ whose table declares so many chunks: lazrs ends the process if it cannot have the memory."""
+    data = bytearray(good.las(".laz"))
+    (first,) = struct.unpack_from("<I", data, 96)
+    (table,) = struct.unpack_from("<q", data, first)
+    struct.pack_into(
+        "<I", data, (table if table >= 0 else struct.unpack_from("<q", data, len(data) - 8)[0]) + 4, chunks
+    )
+    return bytes(data)
+
+
 def npy(shape: str) -> bytes:
     told = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(told)) + told + bytes(100)
@@ -181,7 +192,8 @@ TABLE = [
     ("a.las", las(records=("<I", 100, 2**32 - 1)), "declares 4294967295 records and has room for"),
     ("a.las", las(length=("<H", 105, 3)), "declares points of 3 bytes"),
     ("a.las", las(points=("<Q", 247, 0)), "holds no points"),
-    ("a.laz", good.las(".laz")[:-300], "is no LAS or LAZ file, or is broken"),
+    ("a.laz", good.las(".laz")[:-300], "has no table of its chunks: it is cut off"),
+    ("a.laz", laz(2**32 - 1), "declares 4294967295 chunks and has room for"),
     ("a.e57", b"ASTM-E57" + bytes(8), "ends within its header"),
     ("a.e57", b"ASTM-E57" + struct.pack("<II", 1, 0) + struct.pack("<QQQQ", 2048, 0, 0, 1024), "2048 bytes"),
     # meshes

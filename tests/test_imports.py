@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).parents[1] / "teaser_jax"
 # In the order of the data. A module may import from lines above it, and from its own line downwards never.
 ORDER = [
     "ground.forks", "ground.flags", "ground.arrays", "ground.checks", "ground.numbers", "ground.loops",
-    "ground.branches", "ground.bits", "ground.masked", "ground.io", "ground.extras",
+    "ground.branches", "ground.bits", "ground.masked", "ground.extras", "ground.io",
     "ground.steps",
     "so3", "pose", "reading", "problem", "rows", "solution",
     "stages.pairs", "stages.vote.sweep", "stages.vote.histogram", "stages.scale", "stages.consistency",

@@ -6,6 +6,10 @@ from importlib import import_module
 from types import ModuleType
 
 
+class MissingExtra(ImportError):
+    """A library that is not installed. The message is the line that installs it."""
+
+
 def needed(module: str, what: str, extra: str) -> ModuleType:
     """Import a library of an extra.
 
@@ -15,9 +19,9 @@ def needed(module: str, what: str, extra: str) -> ModuleType:
         extra: The extra that brings it.
 
     Raises:
-        ImportError: If it is missing, with the line that installs it.
+        MissingExtra: If it is missing, with the line that installs it.
     """
     try:
         return import_module(module)
     except ImportError as error:
-        raise ImportError(f"{what}: pip install 'teaser-jax[{extra}]'") from error
+        raise MissingExtra(f"{what}: pip install 'teaser-jax[{extra}]'") from error

@@ -12,6 +12,8 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.lib import format as npy
 
+from teaser_jax.ground.extras import MissingExtra
+
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")  # how archives begin, full and empty ones
 
 # Sizes that a file declares are not trusted.
@@ -90,7 +92,7 @@ def read_archive(path: Path, wanted: Collection[str] | None = None) -> Archive:
 def or_file_error(path: Path, what: str, read: Callable[[], Any], *, quoting: bool = True) -> Any:
     """Return what ``read`` returns; whatever it raises becomes a FileError that says ``what``.
 
-    An OSError, a FileError and an ImportError say more by themselves, and pass.
+    An OSError, a FileError and a MissingExtra say more by themselves, and pass.
 
     With ``quoting`` the words of whoever raised it follow in brackets.
 
@@ -99,7 +101,7 @@ def or_file_error(path: Path, what: str, read: Callable[[], Any], *, quoting: bo
     """
     try:
         return read()
-    except (OSError, FileError, ImportError):
+    except (OSError, FileError, MissingExtra):
         raise
     except Exception as error:
         reason = one_line(error) or type(error).__name__

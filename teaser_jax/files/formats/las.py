@@ -61,6 +61,21 @@ def _check_header(path: Path) -> bool:
     check_room(path, records, SHORTEST_RECORD, min(first, size), item="records")
     if kind & PACKED:
         check_unpacked(path, points * length, size - first)
+        check_room(path, _chunks(path, first, size), SHORTEST_POINT, size - first, item="chunks")
     else:
         check_room(path, points, length, size - first)
     return bool(kind & PACKED)
+
+
+def _chunks(path: Path, first: int, size: int) -> int:
+    """Read how many chunks LAZ declares, each of which begins with a whole point."""
+    with path.open("rb") as file:
+        for place in (first, size - 8):  # what was written in one go has the place of the table at its end
+            file.seek(place)
+            table = int.from_bytes(file.read(8), "little", signed=True)
+            if table >= 0:
+                break
+        if not first < table <= size - 8:
+            raise FileError(f"{path}: has no table of its chunks: it is cut off.")
+        file.seek(table + 4)
+        return int.from_bytes(file.read(4), "little")
