@@ -88,11 +88,11 @@ def read_table(
 def _rows(path: Path, layout: Layout) -> tuple[list[tuple[int, str]], str]:
     """Read the lines that hold something, with their numbers, and the last comment before them."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").replace('"', "").splitlines()
     except UnicodeDecodeError:
         count = layout.numbers.removesuffix(" numbers")
         raise FileError(f"{path}: is not text: expected {count} columns of numbers.") from None
-    numbered = ((number, line.split("#")[0].replace('"', "")) for number, line in enumerate(lines, 1))
+    numbered = ((number, line.partition("#")[0]) for number, line in enumerate(lines, 1))
     rows = [(number, line) for number, line in numbered if line.strip()]
     before = lines[: rows[0][0] - 1] if rows else []
     comments = [line.strip("# \t") for line in before if line.strip("# \t")]
