@@ -87,6 +87,33 @@ def e57(path: Path, scans: list[tuple[np.ndarray, list[float], list[float]]], **
     return path.read_bytes()
 
 
+def fine_e57(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
+    """An E57 with coordinates in double precision and colours of 16 bits, which ``e57`` cannot write."""
+    import pye57
+    from pye57 import libe57
+
+    with pye57.E57(str(path), mode="w") as file:
+        image = file.image_file
+        row, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+        columns = {f"cartesian{axis}": column for axis, column in zip("XYZ", points.T, strict=True)}
+        columns |= {f"color{c}": colours[:, k] for k, c in enumerate(("Red", "Green", "Blue"))}
+        columns = {name: np.ascontiguousarray(column) for name, column in columns.items()}
+        for name, column in columns.items():
+            double = column.dtype == np.float64
+            limits = float(column.min()), float(column.max())
+            node = libe57.FloatNode(image, limits[0], libe57.E57_DOUBLE, *limits) if double else None
+            row.set(name, node or libe57.IntegerNode(image, 0, 0, 2**16 - 1))
+            buffers.append(libe57.SourceDestBuffer(image, name, column, len(column), True, True))
+        scan = libe57.StructureNode(image)
+        scan.set("guid", libe57.StringNode(image, "{1}"))
+        table = libe57.CompressedVectorNode(image, row, libe57.VectorNode(image, True))
+        scan.set("points", table)
+        file.data3d.append(scan)
+        writer = table.writer(buffers)
+        writer.write(len(points))
+        writer.close()
+
+
 def npz(**arrays: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)

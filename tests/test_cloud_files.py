@@ -85,6 +85,16 @@ def test_several_scans_of_e57_stand_in_the_frame_of_the_file(tmp_path, capfd):
     assert "".join(capfd.readouterr()) == ""
 
 
+def test_e57_in_double_precision_with_colours_that_pye57_does_not_read(tmp_path):
+    pytest.importorskip("pye57")
+    path = tmp_path / "a.e57"
+    good.fine_e57(path, good.UTM, good.COLOURS.astype(np.uint16) * 257)
+    cloud = read_cloud(path)
+    np.testing.assert_array_equal(cloud.points, good.UTM)
+    assert cloud.colours is None
+    assert cloud.ignored == ("not read: colours, which not all scans have as bytes",)
+
+
 def test_invalid_points_of_e57_are_counted(tmp_path):
     pytest.importorskip("pye57")
     invalid = np.zeros(good.N, np.int8)
