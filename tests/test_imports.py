@@ -15,7 +15,8 @@ PACKAGE = Path(__file__).parents[1] / "teaser_jax"
 # In the order of the data. A module may import from lines above it, and from its own line downwards never.
 ORDER = [
     "ground.forks", "ground.flags", "ground.arrays", "ground.checks", "ground.numbers", "ground.loops",
-    "ground.branches", "ground.bits", "ground.masked", "ground.io", "ground.steps",
+    "ground.branches", "ground.bits", "ground.masked", "ground.extras", "ground.io",
+    "ground.steps",
     "so3", "pose", "reading", "problem", "rows", "solution",
     "stages.pairs", "stages.vote.sweep", "stages.vote.histogram", "stages.scale", "stages.consistency",
     "stages.one_to_one", "stages.widening",
@@ -45,7 +46,9 @@ ORDER = [
     "clouds.candidates", "clouds.words", "clouds.registration", "clouds.register",
     "metrics", "synthetic.models", "synthetic.protocol", "synthetic.solids", "synthetic.scans",
     "learn.matching", "learn.losses", "learn.teacher", "learn.network", "learn.training",
-    "files.poses", "files.matches", "files.models",
+    "files.tables", "files.poses", "files.matches", "files.models", "files.cloud_file", "files.kinds",
+    "files.formats.meshes", "files.formats.ply", "files.formats.pcd", "files.formats.arrays",
+    "files.formats.bare", "files.formats.las", "files.formats.e57", "files.clouds",
     "plots.style", "plots.answer", "plots.stages", "plots.proofs", "plots.learning",
     "studies.peers", "studies.trials", "studies.methods", "studies.study", "studies.draws",
     "studies.catalogue", "studies.shards",

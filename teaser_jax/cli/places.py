@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from teaser_jax.cli.endings import BadInput
+from teaser_jax.ground.extras import needed
 from teaser_jax.ground.io import replacing
 from teaser_jax.register import Registration
 
@@ -51,9 +52,9 @@ def check_writable(path: Path, source: Path | None = None) -> None:
 def check_matplotlib() -> None:
     """Raise BadInput if no picture can be drawn."""
     try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise BadInput("pictures need matplotlib: pip install 'teaser-jax[viz]'") from None
+        needed("matplotlib.figure", "pictures need matplotlib", "viz")
+    except ImportError as error:
+        raise BadInput(str(error)) from None
 
 
 def draw(path: Path, src: np.ndarray, dst: np.ndarray, result: Registration) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
@@ -11,25 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from teaser_jax.ground.io import (
-    FileError,
-    one_line,
-    or_file_error,
-    os_errors_named,
-    read_archive,
-    visible,
-)
+from teaser_jax.files.tables import TEXT, Layout, read_table
+from teaser_jax.ground.io import FileError, or_file_error, os_errors_named, read_archive, visible
 from teaser_jax.pose import Pose, as_pose
 
-TEXT = (".txt", ".csv", ".tsv", ".dat", ".xyz")
+ROWS = Layout("match", "six numbers", "six, x y z of the source point, then of the target", 6, 6)
 CLOUDS = (".ply", ".pcd", ".las", ".laz", ".bin", ".obj", ".stl")  # known to newcomers
 KNOWN = ("noise_bound", "scale", "cbar2", "mask", "confidence", "pairs")
 TRUTH = "T_dst_src"
 # What others call them.
 ALSO = {"weights": "confidence", "scores": "confidence", "corr_scores": "confidence", "beta": "noise_bound"}
 OF_A_STUDY = {"rotation", "translation", "inliers"}  # beside src and dst in a shard
-DECIMAL_COMMA = re.compile(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?")
-PANDAS_HEADER = ["0", "1", "2", "3", "4", "5"]  # the column names of a table that was given none
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,67 +126,8 @@ def _read_npy(path: Path) -> MatchFile:
 
 
 def _read_text(path: Path) -> MatchFile:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise FileError(f"{path}: is not text: expected six columns of numbers.") from None
-    numbered = ((number, line.split("#")[0].replace('"', "")) for number, line in enumerate(lines, 1))
-    rows = [(number, line) for number, line in numbered if line.strip()]
-    delimiter = next((d for d in ";,\t|" if rows and d in rows[0][1]), None)
-    if rows and _is_header(_fields(rows[0][1], delimiter)):
-        rows = rows[1:]
-    if rows and _has_decimal_commas(rows[0][1], delimiter):
-        delimiter = None if delimiter == "," else delimiter
-        rows = [(number, line.replace(",", ".")) for number, line in rows]
-    if not rows:
-        raise FileError(f"{path}: holds no match: expected six numbers a row.")
-    reason = ""
-    try:
-        table = np.loadtxt([line for _, line in rows], delimiter=delimiter, ndmin=2)
-    except ValueError as error:
-        table, reason = np.empty((0, 0)), str(error)
-    if table.shape[1] != 6:
-        for number, line in rows:
-            _check_line(f"{path}: line {number}", _fields(line, delimiter))
-        raise FileError(f"{path}: cannot be read ({one_line(reason)}): expected six numbers a row.")
+    table = read_table(path, ROWS).rows
     return MatchFile(table[:, :3], table[:, 3:], {})
-
-
-def _fields(line: str, delimiter: str | None) -> list[str]:
-    return [field.strip() for field in line.split(delimiter)]
-
-
-def _is_header(fields: list[str]) -> bool:
-    """Tell whether a first row holds column names: anything else that is no number is an error instead."""
-    return fields == PANDAS_HEADER or all(
-        any(c.isalpha() for c in field) and not _is_number(field) for field in fields
-    )
-
-
-def _has_decimal_commas(line: str, delimiter: str | None) -> bool:
-    """Tell whether commas are decimal points: six numbers with commas, and something else between them."""
-    fields = _fields(line, None if delimiter == "," else delimiter)
-    return "," in line and len(fields) == 6 and all(DECIMAL_COMMA.fullmatch(field) for field in fields)
-
-
-def _check_line(where: str, fields: list[str]) -> None:
-    if len(fields) != 6:
-        raise FileError(
-            f"{where} has {len(fields)} columns: expected six, x y z of the source point, then of the target."
-        )
-    for column, field in enumerate(fields, 1):
-        if not field:
-            raise FileError(f"{where} has nothing in column {column}: leave the row out, or write nan there.")
-        if not _is_number(field):
-            raise FileError(f"{where} holds '{visible(field)}' in column {column}: expected six numbers.")
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return True
 
 
 def _finite(array: np.ndarray) -> np.ndarray:

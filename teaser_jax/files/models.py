@@ -9,37 +9,41 @@ from typing import Any
 import numpy as np
 from jaxtyping import Real
 
+from teaser_jax.ground.extras import needed
 from teaser_jax.ground.io import FileError, or_file_error, os_errors_named
 from teaser_jax.synthetic.models import Triangles
 
 
-def read_shape(path: str | PathLike[str]) -> Real[np.ndarray, "m 3"] | Triangles:
+def read_shape(path: str | PathLike[str], *, kind: str | None = None) -> Real[np.ndarray, "m 3"] | Triangles:
     """Read points from ``.npy``, or points or triangles from what trimesh reads (PLY, OBJ, STL, OFF, ...).
 
     Args:
         path: The file. One with triangles gives ``Triangles``, from which any number of points can be drawn.
+        kind: What it is, as in "ply"; None: what its name says.
 
     Raises:
         FileError: If the file is missing or broken or holds no points.
-        ImportError: Without the extra ``studies``, for anything but ``.npy``.
+        ImportError: Without the extra ``clouds``, for anything but ``.npy``.
     """
     path = Path(path)
     if path.is_dir():
         raise FileError(f"{path}: is a folder: name the file of a model in it.")
     if not path.is_file():
         raise FileError(f"{path}: no such file: give a model with triangles or points, or 'procedural'.")
-    read = _by_numpy if path.suffix == ".npy" else _by_trimesh
-    if read is _by_trimesh:
-        _check_trimesh()
+    by_us = kind is None and path.suffix == ".npy"
+    if not by_us:
+        needed("trimesh", "reading models needs trimesh", "clouds")
     what = "cannot be read as a model"
     # What trimesh says of a broken file speaks of its own insides.
     advice = (
         f"{what}: it is broken, or no {path.suffix or 'file'} that trimesh reads; PLY, OBJ, STL and OFF are"
     )
     with os_errors_named(path, what):
-        by_us = read is _by_numpy
-        shape = or_file_error(path, what if by_us else advice, lambda: read(path), quoting=by_us)
+        read = (lambda: _by_numpy(path)) if by_us else (lambda: _by_trimesh(path, kind))
+        shape = or_file_error(path, what if by_us else advice, read, quoting=by_us)
     points = np.asarray(shape.vertices if isinstance(shape, Triangles) else shape)
+    if len(points) == 0 and not by_us:
+        raise FileError(f"{path}: {advice}.")
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu" or len(points) < 4:
         raise FileError(f"{path}: holds an array of shape {points.shape}: expected (m, 3) points.")
     if not np.isfinite(points).all():
@@ -47,22 +51,14 @@ def read_shape(path: str | PathLike[str]) -> Real[np.ndarray, "m 3"] | Triangles
     return shape
 
 
-def _check_trimesh() -> None:
-    """Raise ImportError with the name of the extra, rather than call the file broken."""
-    try:
-        import trimesh  # noqa: F401
-    except ImportError:
-        raise ImportError("reading models needs trimesh: pip install 'teaser-jax[studies]'") from None
-
-
 def _by_numpy(path: Path) -> np.ndarray:
     return np.load(path, allow_pickle=False)
 
 
-def _by_trimesh(path: Path) -> np.ndarray | Triangles:
+def _by_trimesh(path: Path, kind: str | None) -> np.ndarray | Triangles:
     import trimesh
 
-    found: Any = trimesh.load(path, process=False)
+    found: Any = trimesh.load(path, file_type=kind, process=False, skip_materials=True)
     if isinstance(found, trimesh.Scene):
         found = found.to_geometry()
     vertices, faces = np.asarray(found.vertices, np.float64), getattr(found, "faces", None)

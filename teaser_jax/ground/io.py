@@ -4,12 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
+from zipfile import ZipFile
 
 import numpy as np
+from numpy.lib import format as npy
+
+from teaser_jax.ground.extras import MissingExtra
 
 ZIP = (b"PK\x03\x04", b"PK\x05\x06")  # how archives begin, full and empty ones
+
+# Sizes that a file declares are not trusted.
+MOST_UNPACKED = 100  # times the size of the file: clouds are packed into a tenth
+ALWAYS_UNPACKED = 2**26  # bytes, which do no harm
 
 
 class FileError(ValueError):
@@ -41,6 +50,24 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def check_room(path: Path, count: int, size: int, room: int, *, item: str = "points") -> None:
+    """Raise FileError unless so many items of so many bytes fit into what is left of a file."""
+    if count < 0 or count * size > room:
+        raise FileError(
+            f"{path}: declares {count} {item} and has room for {max(room, 0) // size}: it is cut off, or its "
+            "header is wrong."
+        )
+
+
+def check_unpacked(path: Path, unpacked: int, packed: int) -> None:
+    """Raise FileError if a file declares that far more is packed into it than clouds can be."""
+    if unpacked > max(MOST_UNPACKED * packed, ALWAYS_UNPACKED):
+        raise FileError(
+            f"{path}: declares {unpacked / 2**20:.0f} MB packed into {packed / 2**20:.3g} MB, which no cloud "
+            "is: its header is wrong, or it is made to do harm."
+        )
+
+
 class Archive(NamedTuple):
     """What an ``.npz`` holds: the arrays that were asked for, and the names of all."""
 
@@ -63,7 +90,9 @@ def read_archive(path: Path, wanted: Collection[str] | None = None) -> Archive:
 
 
 def or_file_error(path: Path, what: str, read: Callable[[], Any], *, quoting: bool = True) -> Any:
-    """Return what ``read`` returns; whatever it raises, but OSError, becomes a FileError that says ``what``.
+    """Return what ``read`` returns; whatever it raises becomes a FileError that says ``what``.
+
+    An OSError, a FileError and a MissingExtra say more by themselves, and pass.
 
     With ``quoting`` the words of whoever raised it follow in brackets.
 
@@ -72,7 +101,7 @@ def or_file_error(path: Path, what: str, read: Callable[[], Any], *, quoting: bo
     """
     try:
         return read()
-    except OSError:
+    except (OSError, FileError, MissingExtra):
         raise
     except Exception as error:
         reason = one_line(error) or type(error).__name__
@@ -99,4 +128,20 @@ def _arrays(path: Path, wanted: Collection[str] | None) -> Archive:
         file.seek(0)
         archive = np.load(file, allow_pickle=False)
         names = tuple(archive.files)
+        for name in names:
+            if wanted is None or name in wanted:
+                _check_member(path, archive.zip, name)
         return Archive({name: archive[name] for name in names if wanted is None or name in wanted}, names)
+
+
+def _check_member(path: Path, archive: ZipFile, name: str) -> None:
+    """Raise FileError if an array of an archive declares more than there is."""
+    member = f"{name}.npy" if f"{name}.npy" in archive.namelist() else name
+    size = archive.getinfo(member).file_size
+    check_unpacked(path, size, path.stat().st_size)
+    with archive.open(member) as file:
+        version = npy.read_magic(file)
+        read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
+        if read is not None:  # others hold names that are not Latin
+            shape, _, kind = read(file)
+            check_room(path, prod(shape), max(kind.itemsize, 1), size - file.tell(), item="numbers")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.extras import needed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,14 +26,11 @@ def new_figure(size: tuple[Number, Number]) -> Figure:
     Raises:
         ImportError: If matplotlib is missing.
     """
-    try:
-        from matplotlib.figure import Figure
-        from matplotlib.layout_engine import ConstrainedLayoutEngine
-    except ImportError as error:
-        raise ImportError("plots need matplotlib: pip install 'teaser-jax[viz]'") from error
-    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+    parts = ("figure", "layout_engine")
+    figure, engine = (needed(f"matplotlib.{part}", "plots need matplotlib", "viz") for part in parts)
+    layout = engine.ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
     width, height = (float(x) for x in size)
-    return Figure(figsize=(width, height), dpi=150, facecolor="white", layout=layout)
+    return figure.Figure(figsize=(width, height), dpi=150, facecolor="white", layout=layout)
 
 
 def label(axes: Axes, title: str, x: str, y: str, *, counts: bool = True) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from teaser_jax.ground.arrays import Number
+from teaser_jax.ground.extras import needed
 from teaser_jax.ground.io import FileError, os_errors_named, replacing
 from teaser_jax.plots.style import INK, LEGEND_COLUMNS, PALE, Axes, Figure, label, legend, new_figure
 from teaser_jax.studies.looks import Look, look_of
@@ -206,9 +207,6 @@ def _page(results: Results) -> str:
 
 
 def _plotly() -> tuple[Any, Any]:
-    try:
-        import plotly.graph_objects as go
-        from plotly.subplots import make_subplots
-    except ImportError:
-        raise ImportError("studies draw pages with plotly: pip install 'teaser-jax[studies]'") from None
-    return go, make_subplots
+    what = "studies draw pages with plotly"
+    subplots = needed("plotly.subplots", what, "studies")
+    return needed("plotly.graph_objects", what, "studies"), subplots.make_subplots

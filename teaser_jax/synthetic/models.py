@@ -59,7 +59,7 @@ def sample_model(rng: np.random.Generator, n: int, model: Shape = None) -> Point
         ValueError: If the model has fewer points than ``n``, or triangles without any area.
     """
     if isinstance(model, Triangles):
-        points = _on_triangles(rng, n, model)
+        points = sample_triangles(rng, n, model)
     else:
         pool = teapot(max(n, 20_000)) if model is None else np.asarray(model, float)
         if n > len(pool):
@@ -118,7 +118,8 @@ def _teapot_slope(x: Points, step: float = 1e-5) -> Points:
     return np.stack(central, axis=1) / (2 * step)
 
 
-def _on_triangles(rng: np.random.Generator, n: int, model: Triangles) -> Points:
+def sample_triangles(rng: np.random.Generator, n: int, model: Triangles) -> Points:
+    """Draw points evenly from triangles, where they stand. Raises ValueError if they have no area."""
     a, b, c = np.moveaxis(np.asarray(model.vertices, float)[np.asarray(model.faces)], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     if not area.sum() > 0:

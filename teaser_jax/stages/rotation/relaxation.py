@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from teaser_jax import so3
+from teaser_jax.ground.extras import needed
 from teaser_jax.ground.numbers import as_record, named
 from teaser_jax.stages.rotation.gnc import Gnc
 from teaser_jax.stages.rotation.pair_search import polish, search_pairs
@@ -166,10 +167,7 @@ def relax(cost_matrix: np.ndarray, *, accuracy: float = 1e-6, iterations: int = 
 
     References: Yang, Shi, Carlone, T-RO 2021, Proposition 12; O'Donoghue et al., JOTA 2016 (SCS).
     """
-    try:
-        import scs
-    except ImportError as error:
-        raise ImportError("the relaxation needs a conic solver: pip install 'teaser-jax[sdp]'") from error
+    scs = needed("scs", "the relaxation needs a conic solver", "sdp")
     from scipy.sparse import csc_matrix
 
     n = len(cost_matrix) // 4

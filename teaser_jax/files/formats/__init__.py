@@ -1,0 +1,1 @@
+"""One reader for each kind of file. ``files.clouds`` chooses among them."""
