@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from teaser_jax.clouds.neighbours import Neighbours
 from teaser_jax.ground.arrays import AnyArray, Number
@@ -129,10 +129,26 @@ def _simple(
     theta = jnp.arctan2(_dot(_cross(u, v), second), _dot(u, second))
     count = jnp.sum(near, dtype=jnp.int32)
     scaled = jnp.stack([(theta + np.pi) / (2 * np.pi), (alpha + 1) / 2, (phi + 1) / 2])
-    bins = jnp.clip((BINS * scaled).astype(jnp.int32), 0, BINS - 1)
-    hits = (bins[:, None, :] == jnp.arange(BINS, dtype=jnp.int32)[None, :, None]) & near[None, None]
-    counts = jnp.sum(hits, axis=2, dtype=jnp.int32).astype(point.dtype).reshape(3 * BINS)
+    bins = jnp.clip((BINS * scaled).astype(jnp.uint32), 0, BINS - 1)
+    counts = _counted(jnp.where(near, bins, BINS)).astype(point.dtype).reshape(3 * BINS)
     return counts * (100 / jnp.maximum(count, 1).astype(point.dtype)), count
+
+
+def _counted(bins: UInt32[Array, "3 k"]) -> UInt32[Array, "3 11"]:
+    """Count how often each bin occurs; the number of bins itself stands for none.
+
+    Several counters share a word, so that a few sums do for eleven; and the bins are computed once, not
+    anew for each sum that reads them.
+    """
+    bins = lax.optimization_barrier(bins)
+    width = 8 if bins.shape[1] < 2**8 else 16  # of a counter, in bits
+    a_word = 32 // width
+    words = -(-(BINS + 1) // a_word)
+    unit = jnp.left_shift(jnp.uint32(1), width * (bins % a_word))
+    own = (bins // a_word)[:, None, :] == jnp.arange(words, dtype=jnp.uint32)[None, :, None]
+    packed = jnp.sum(jnp.where(own, unit[:, None, :], 0), axis=2, dtype=jnp.uint32)
+    counters = packed[:, :, None] >> jnp.arange(0, 32, width, dtype=jnp.uint32)[None, None]
+    return (counters & (2**width - 1)).reshape(3, -1)[:, :BINS]
 
 
 def _dot(a: Vectors, b: Vectors) -> Array:

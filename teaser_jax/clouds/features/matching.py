@@ -15,7 +15,7 @@ from teaser_jax.clouds.sizes import rows_for
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.ground.checks import whole_number
 
-ROWS_AT_ONCE = 128  # of a table of distances: it stays in the cache
+ROWS_AT_ONCE = 16  # of a table of distances: it stays in the innermost cache
 
 
 class Nearest(NamedTuple):
@@ -63,16 +63,19 @@ def nearest(
     """
     n, m = a.shape[0], b.shape[0]
     missing = -n % ROWS_AT_ONCE
-    a_rows = jnp.pad(a, ((0, missing), (0, 0))).reshape(-1, ROWS_AT_ONCE, a.shape[1])
     usable = jnp.pad(valid_a, (0, missing)).reshape(-1, ROWS_AT_ONCE)
-    beside = jnp.where(valid_b, jnp.sum(b * b, axis=1), jnp.inf)
+    # |a|^2 + |b|^2 - 2 a b as one product: the table is written once, and complete.
+    long_a = jnp.stack([jnp.sum(a * a, axis=1), jnp.ones_like(a[:, 0])], axis=1)
+    long_b = jnp.stack([jnp.ones_like(b[:, 0]), jnp.where(valid_b, jnp.sum(b * b, axis=1), jnp.inf)], axis=1)
+    a_rows = jnp.pad(jnp.concatenate([-2 * a, long_a], axis=1), ((0, missing), (0, 0)))
+    a_rows = a_rows.reshape(-1, ROWS_AT_ONCE, a_rows.shape[1])
+    b_columns = jnp.concatenate([b, long_b], axis=1).T
     columns = jnp.arange(m, dtype=jnp.int32)
 
     def compare(state: tuple[Array, Array, Array], rows: tuple[Array, Array]) -> tuple:
         best, back, start = state
         some, used = rows
-        table = beside[None] - 2 * jnp.matmul(some, b.T, precision=lax.Precision.HIGHEST)
-        table += jnp.sum(some * some, axis=1)[:, None]
+        table = jnp.matmul(some, b_columns, precision=lax.Precision.HIGHEST)
         # The smallest number, then where it stands: two passes of vectors beat one of pairs.
         least = jnp.min(table, axis=1)
         where = jnp.min(jnp.where(table == least[:, None], columns[None], m), axis=1)
