@@ -68,7 +68,7 @@ def _add_register(register: argparse.ArgumentParser) -> None:
     # Options that are not given stay absent: then the file speaks, then the defaults of the function.
     register.add_argument(
         "--scale", type=_scale, default=argparse.SUPPRESS, metavar="S|estimate",
-        help="the known scale (default: scale in the file of matches, or 1); of matches also the word estimate",
+        help="the known scale (default: that in the file of matches, or 1); of matches also: estimate",
     )  # fmt: skip
     _add_matches(register.add_argument_group("of matches"))
     _add_clouds(register.add_argument_group("of two clouds"))
@@ -77,7 +77,11 @@ def _add_register(register: argparse.ArgumentParser) -> None:
 def _add_clouds(register: argparse._ArgumentGroup) -> None:
     absent = argparse.SUPPRESS
     for name, metavar, text in (
-        ("voxel-size", "V", "width of the cells that the verdict rests on (default: chosen from both clouds)"),
+        (
+            "voxel-size",
+            "V",
+            "width of the cells that the verdict rests on (default: chosen)",
+        ),
         ("tolerance", "L", "how far points of the overlap may be off at the most (default: two voxels)"),
         ("initial-error", "L", "how far the initial pose may have points of the overlap off"),
         ("max-range", "L", "leave out points further from the viewpoint, or the origin"),
@@ -87,7 +91,7 @@ def _add_clouds(register: argparse._ArgumentGroup) -> None:
     for name in ("src", "dst"):
         register.add_argument(
             f"--{name}-viewpoint", type=float, nargs=3, default=absent, metavar=("X", "Y", "Z"),
-            help=f"where the sensor of the {'first' if name == 'src' else 'second'} cloud stood, in its frame",
+            help=f"where the sensor of the {'first' if name == 'src' else 'second'} cloud stood",
         )  # fmt: skip
     register.add_argument(
         "--initial", type=Path, default=absent, metavar="TXT",

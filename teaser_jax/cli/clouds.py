@@ -22,11 +22,13 @@ from teaser_jax.files.poses import read_poses, write_pose
 from teaser_jax.ground.io import one_line
 
 OPTIONS = (
-    "voxel_size", "tolerance", "src_viewpoint", "dst_viewpoint", "initial_error", "max_range", "threads", "seconds"
+    "voxel_size", "tolerance", "src_viewpoint", "dst_viewpoint", "initial_error", "max_range", "threads",
+    "seconds",
 )  # fmt: skip
 CLOUDS_ONLY = (*OPTIONS, "initial", "crop", "refine", "html", "merged")
 MATCHES_ONLY = (
-    "noise_bound", "cbar2", "certify", "clique", "rotation", "clique_seconds", "clique_nodes", "tim_graph", "vote"
+    "noise_bound", "cbar2", "certify", "clique", "rotation", "clique_seconds", "clique_nodes", "tim_graph",
+    "vote",
 )  # fmt: skip
 
 
@@ -91,7 +93,7 @@ def _answer(arguments: argparse.Namespace, src: CloudFile, dst: CloudFile) -> tj
     known: dict[str, Any] = {name: given[name] for name in OPTIONS if name in given}
     if "scale" in given:
         if given["scale"] is None:
-            raise BadInput("--scale estimate belongs to a file of matches: of two clouds give the known scale")
+            raise BadInput("--scale estimate belongs to matches: of two clouds give the known scale")
         known["scale"] = given["scale"]
     if "crop" in given:
         known["crop"] = np.reshape(given["crop"], (2, 3))
@@ -132,7 +134,7 @@ def _write(
 
 
 def _write_merged(path: Path, result: tj.CloudRegistration, src: CloudFile, dst: CloudFile) -> None:
-    """Write the points of both clouds in the frame of the target; colours and intensity where both have them."""
+    """Write both clouds in the frame of the target, with colours and intensity where both have them."""
     finite = [np.isfinite(x.points).all(axis=1) for x in (src, dst)]
     points = np.concatenate([result.pose.apply(src.points[finite[0]]), dst.points[finite[1]]])
     both: dict[str, Any] = {}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from teaser_jax import metrics
-from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
+from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.pose import Pose
 from teaser_jax.register import Registration
 

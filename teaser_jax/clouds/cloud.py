@@ -15,6 +15,7 @@ FEWEST = 100  # points of which a shape can be told
 # Strays lie further outside the box of the middle 98 % of the points than that box is long.
 TAIL = 1.0  # percent, at each end
 ASKED = 50_000  # points that tell where the middle is
+ODD = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)  # numbers that mix bits well
 
 
 @dataclass(frozen=True)
@@ -165,13 +166,15 @@ def _strays(points: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, " n"]) -> B
 
 def _repeated(points: Float[np.ndarray, "n 3"], keep: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """Tell which points are the same as an earlier one, by sorting a number that mixes the coordinates."""
-    rows = np.flatnonzero(keep)
+    rows, gone = np.flatnonzero(keep), np.zeros(len(points), bool)
     words = np.ascontiguousarray(points[rows] + 0.0).view(np.uint64)  # of two zeros one
-    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    mixed = (words ^ (words >> np.uint64(29))) * odd
-    number = mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(7)) ^ (mixed[:, 2] << np.uint64(9))
+    number = np.zeros(len(rows), np.uint64)
+    for column, odd, shift in zip(words.T, ODD, (0, 7, 9), strict=True):
+        number ^= ((column ^ (column >> np.uint64(29))) * np.uint64(odd)) >> np.uint64(shift)
+    ordered = np.sort(number)  # many times faster than to find the order
+    if (ordered[1:] != ordered[:-1]).all():
+        return gone
     order = np.argsort(number, kind="stable")
     same = (words[order[1:]] == words[order[:-1]]).all(axis=1)
-    gone = np.zeros(len(points), bool)
     gone[rows[order[1:][same]]] = True
     return gone

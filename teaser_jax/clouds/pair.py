@@ -13,10 +13,9 @@ from jaxtyping import Float
 from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.pairing import moved
-from teaser_jax.clouds.voxel import POINTS_A_CELL, count_cells, downsample
+from teaser_jax.clouds.voxel import POINTS_A_CELL, count_cells
 from teaser_jax.pose import Pose
 
-LEAST_SPACINGS = 1.6  # of the sampling: cells finer than this hold one point each
 USUAL_CELLS = 6000  # of the smaller cloud, at the width that a user may give
 MARGIN_CELLS, MARGIN_SHARE = 10, 0.1  # around a scan in a map, in cells and in extents of the scan
 FEWEST_AROUND = 20
@@ -51,7 +50,7 @@ class Pair:
             width = self.voxel_size * (USUAL_CELLS / cells) ** 0.5
         else:
             width = min(x.width_for(min(cells, len(x) // POINTS_A_CELL)) for x in clouds)
-            width = max(width, *(LEAST_SPACINGS * x.spacing for x in clouds))
+            width = max(x.at_least_sampled(width) for x in clouds)
         for x in clouds:
             if len(x) > most and count_cells(x.cloud.points, width) > most:
                 width = max(width, x.width_for(most))
@@ -64,18 +63,19 @@ class Pair:
             width = self.width(cells, most)
             return self.src.surface(width), self.dst.surface(width)
 
-    def surfaces_near(self, pose: Float[np.ndarray, "4 4"], cells: int, most: int) -> tuple[Surface, Surface]:
+    def surfaces_near(
+        self, pose: Float[np.ndarray, "4 4"], cells: int, most: int, *, quick: bool = False
+    ) -> tuple[Surface, Surface]:
         """Cut both clouds into cells; of a map only what lies around the other cloud."""
         with self.timed("cells"):
             width = self.width(cells, most)
-            near_dst = _around(self.dst, moved(pose, self.src.cloud.points), width)
-            there = self.dst.cloud.points if near_dst is None else near_dst
+            near_dst = _around(self.dst, moved(pose, self.src.outline), width)
+            there = self.dst.outline if near_dst is None else near_dst
             near_src = _around(self.src, moved(np.linalg.inv(pose), there), width)
             return tuple(  # type: ignore[return-value]
-                x.surface(width) if part is None else
-                Surface(downsample(part, width), width, x.cloud.viewpoint, x.threads)
+                x.surface(width, quick=quick) if part is None else x.cut(part, width, quick)
                 for x, part in ((self.src, near_src), (self.dst, near_dst))
-            )  # fmt: skip
+            )
 
     def centred(self, pose: Pose) -> Float[np.ndarray, "4 4"]:
         """Write a pose between the frames as given as one between the middles."""
@@ -106,8 +106,11 @@ def _matrix(rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -
 
 def _around(cloud: Prepared, part: Float[np.ndarray, "m 3"], cell: float) -> Float[np.ndarray, "k 3"] | None:
     """Cut out of a map what lies around a part of it; None where that is more than half: leave it whole."""
-    points = cloud.cloud.points
     low, high = part.min(axis=0), part.max(axis=0)
     margin = MARGIN_CELLS * cell + MARGIN_SHARE * (high - low).max()
-    inside = ((points > low - margin) & (points < high + margin)).all(axis=1)
-    return points[inside] if FEWEST_AROUND < np.count_nonzero(inside) < len(points) / 2 else None
+    inside = lambda points: ((points > low - margin) & (points < high + margin)).all(axis=1)
+    if np.mean(inside(cloud.outline)) >= 0.5:
+        return None
+    points = cloud.cloud.points
+    there = inside(points)
+    return points[there] if np.count_nonzero(there) > FEWEST_AROUND else None

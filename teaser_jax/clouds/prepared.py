@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from teaser_jax.clouds.cloud import Cloud, as_cloud
 from teaser_jax.clouds.neighbours import Tree
@@ -16,6 +17,9 @@ from teaser_jax.clouds.voxel import POINTS_A_CELL, downsample, spacing, voxel_si
 from teaser_jax.ground.checks import whole_number
 
 STEPS = 4  # widths of cells that a kept cloud is cut into, between one and twice as wide
+LEAST_SPACINGS = 1.6  # of the sampling: cells finer than this hold one point each
+THINNED, ROUGHLY = 40_000, 20_000  # points that tell how far they lie apart; how wide cells are, about
+FINER = 4.0  # times finer are cells whose means stand for the points, where cells are counted
 LADDER_CELLS = 6000  # of the step that all others are counted from
 
 
@@ -33,7 +37,7 @@ class Prepared:
     threads: int = 1
     is_kept: bool = False
     _widths: dict[int, float] = field(default_factory=dict)
-    _surfaces: dict[float, Surface] = field(default_factory=dict)
+    _surfaces: dict[tuple[float, bool], Surface] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Prepared({self.cloud!r})"
@@ -54,20 +58,52 @@ class Prepared:
     def width_for(self, cells: int) -> float:
         """Find the width of cells that leaves about so many [length]."""
         if cells not in self._widths:
-            self._widths[cells] = voxel_size_for(self.cloud.points, cells)
+            few, finest = self._thinned
+            width = voxel_size_for(few, cells)
+            self._widths[cells] = width if width >= finest else voxel_size_for(self.cloud.points, cells)
         return self._widths[cells]
+
+    def at_least_sampled(self, width: float) -> float:
+        """Widen cells to one and a half distances between neighbouring points [length].
+
+        Some of the points lie further apart than all: where even they lie near enough, no more is asked.
+        """
+        points = self.cloud.points
+        some = points[:: max(1, len(points) // THINNED)]
+        most = LEAST_SPACINGS * spacing(Tree(some, self.threads))
+        return width if most <= width else max(width, LEAST_SPACINGS * self.spacing)
+
+    @cached_property
+    def _thinned(self) -> tuple[Float[np.ndarray, "n 3"], float]:
+        """Fewer points that fill as many cells, and the finest cells of which that is true [length]."""
+        points = self.cloud.points
+        if len(points) < 2 * THINNED:
+            return points, 0.0
+        some = points[:: len(points) // ROUGHLY]
+        fine = voxel_size_for(some, LADDER_CELLS) / FINER
+        few = downsample(points, fine)
+        return (few, 2 * fine) if len(few) < len(points) / 2 else (points, 0.0)
+
+    @cached_property
+    def outline(self) -> Float[np.ndarray, "n 3"]:
+        """Some of the points, which tell where the cloud is [length]."""
+        points = self.cloud.points
+        return points[:: max(1, len(points) // ROUGHLY)]
 
     def next_step(self, width: float) -> float:
         """Find the next width, not below this one, that a kept cloud is cut at [length]."""
         first = self.width_for(min(LADDER_CELLS, len(self) // POINTS_A_CELL))
         return float(first * 2 ** (np.ceil(STEPS * np.log2(width / first) - 1e-9) / STEPS))
 
-    def surface(self, width: float) -> Surface:
-        """Cut the cloud into cells of a width."""
-        if width not in self._surfaces:
-            points = downsample(self.cloud.points, width)
-            self._surfaces[width] = Surface(points, width, self.cloud.viewpoint, self.threads)
-        return self._surfaces[width]
+    def surface(self, width: float, *, quick: bool = False) -> Surface:
+        """Cut the cloud into cells of a width; a quick surface has rougher normals."""
+        if (width, quick) not in self._surfaces:
+            self._surfaces[width, quick] = self.cut(self.cloud.points, width, quick)
+        return self._surfaces[width, quick]
+
+    def cut(self, points: Float[np.ndarray, "n 3"], width: float, quick: bool) -> Surface:
+        """Cut some points of the cloud into cells."""
+        return Surface(downsample(points, width), width, self.cloud.viewpoint, self.threads, quick)
 
     def scaled(self, scale: float) -> Prepared:
         """Make the cloud larger by a factor; 1 leaves it as it is, with all that is known of it."""

@@ -33,12 +33,14 @@ class Surface:
         voxel_size: Width of a cell [length].
         viewpoint: Where the sensor stood; None: unknown.
         threads: How many threads to ask neighbours with.
+        quick: Whether normals may be rougher, those of the library of alignment, which it needs in any case.
     """
 
     points: Float[np.ndarray, "n 3"]
     voxel_size: float
     viewpoint: Float[np.ndarray, "3"] | None = None
     threads: int = 1
+    quick: bool = False
 
     def __len__(self) -> int:
         return len(self.points)
@@ -51,6 +53,8 @@ class Surface:
     @cached_property
     def normals(self) -> Float[np.ndarray, "n 3"]:
         """Unit normals, zero where the points make no surface."""
+        if self.quick:
+            return np.array(self.for_alignment[0].normals())[:, :3]
         return self._normals(self.tree.neighbours(self.points, FEW_NEIGHBOURS))
 
     @cached_property

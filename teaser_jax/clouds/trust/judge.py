@@ -24,6 +24,7 @@ from teaser_jax.solution import Status
 
 CELLS, MOST_CELLS = 6000, 10**9  # of the smaller cloud; a map may have as many as it needs
 FINE_CELLS, MOST_FINE_CELLS = 20_000, 400_000
+FINE_ASKED = 5000  # of the finer cells
 FINER = 0.8  # of the width: another look is worth it only where cells become so much smaller
 # What a pose must reach.
 FEWEST_CELLS = 300
@@ -194,11 +195,11 @@ def _at_finer_cells(
     """
     a, b = src, dst
     if pair.width(FINE_CELLS, MOST_FINE_CELLS) < FINER * dst.voxel_size:
-        a, b = pair.surfaces_near(pose, FINE_CELLS, MOST_FINE_CELLS)
+        a, b = pair.surfaces_near(pose, FINE_CELLS, MOST_FINE_CELLS, quick=True)
     with pair.timed("alignment"):
-        before = min(x.fit for x in both_ways(pose, a, b))
+        before = min(x.fit for x in both_ways(pose, a, b, FINE_ASKED))
         if refine is None:
             return _Finer(pose, b.voxel_size, before)
         other = align(pose, a, b, method=refine)
-        after = min(x.fit for x in both_ways(other, a, b))
+        after = min(x.fit for x in both_ways(other, a, b, FINE_ASKED))
     return _Finer(other, b.voxel_size, after) if after >= before else _Finer(pose, b.voxel_size, before)

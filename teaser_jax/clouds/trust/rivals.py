@@ -22,6 +22,7 @@ from teaser_jax.clouds.trust.pairing import Pairing, both_ways, moved, pair, sha
 DIFFERENT = 2.5  # cells of displacement on average that make another pose
 ASKED, SCREENED, FIRST_LOOK = 400, 200, 50  # cells asked of alternatives: the last, the better, all
 LOOKED_AT_TWICE, TRIED = 60, 6  # alternatives; those that are aligned
+ALIGNED_CELLS = 1500  # of those that fit, to align them elsewhere
 WORTH_A_TRY = 0.3  # of the cells asked
 LIKE = 0.80  # a share of the fitting cells that makes a pose as good
 
@@ -97,12 +98,14 @@ def find_rivals(
         motions = motions[[astray(motion) <= guess.error for motion in motions]]
     if len(motions) == 0:
         return NONE
+    every = chosen[:: max(1, len(chosen) // ALIGNED_CELLS)]
+    fitting = Surface(src.points[every], cell, threads=src.threads)  # what another pose has to explain
     quick = _screened(motions @ pose, src, dst, asked)
     found = Rivals(min(float(quick.max()), WORTH_A_TRY), 0.0, NONE.lead, ())
     for k in np.argsort(-quick, kind="stable")[:TRIED]:
         if quick[k] <= WORTH_A_TRY:
             break
-        other = align(align(motions[k] @ pose, src, dst, reach=4.0), src, dst)
+        other = align(align(motions[k] @ pose, fitting, dst, reach=4.0), fitting, dst)
         if apart(other @ np.linalg.inv(pose)) < DIFFERENT * cell:  # it fell back: judge it where it stood
             other = motions[k] @ pose
         share = _share(pair(other, src, dst, asked), ASKED // 2)
