@@ -26,9 +26,10 @@ from teaser_jax.clouds.parts.settle import settle
 from teaser_jax.clouds.parts.sight import likely_eyes
 from teaser_jax.clouds.parts.sweep import lattice_of, sweep
 from teaser_jax.clouds.parts.turns import even_rotations
-from teaser_jax.clouds.parts.weigh import Cells, Cover, cover, quick_covers
+from teaser_jax.clouds.parts.weigh import Cells, Cover, FinePart, FineScan, cover, quick_covers
 from teaser_jax.clouds.sizes import padded
 from teaser_jax.clouds.surface import FEW_NEIGHBOURS, Surface
+from teaser_jax.clouds.symmetry import MARGIN, Axis, shared_axis, turned
 from teaser_jax.clouds.voxel import LEAST_SPACINGS, downsample, spacing, voxel_size_for
 
 # One of 4096 rotations lies within 12 deg of any, and the rounds of alignment reach a tenth of the part.
@@ -68,14 +69,27 @@ class Searched:
     Attributes:
         found: At least one.
         cell: Width of the cells that distances were measured by [length].
+        axis: About which the part may be turned by any angle, in its frame; None: there is no such axis.
         knows_viewpoint: Whether the viewpoint of the scan was given, and not guessed.
         seconds: What each stage took [s].
     """
 
     found: tuple[Found, ...]
     cell: float
+    axis: Axis | None
     knows_viewpoint: bool
     seconds: dict[str, float]
+
+    @property
+    def equivalent(self) -> tuple[Found, ...]:
+        """The poses that are as good as the best, itself among them: the symmetry of what the scan shows."""
+        return tuple(x for x in self.found if is_as_good(x, self.found[0]))
+
+    @property
+    def ok(self) -> bool:
+        """Whether this is the part in the scan: then one of the equivalent poses is right."""
+        best = self.found[0].cover
+        return self.knows_viewpoint and best.scan > LEAST_OF_SCAN and best.part > LEAST_OF_PART
 
 
 def search(part: Cloud, scan: Cloud, *, threads: int = 1, seconds: float | None = None) -> Searched:
@@ -98,15 +112,14 @@ def search(part: Cloud, scan: Cloud, *, threads: int = 1, seconds: float | None 
         poses = _swept(task)
     with task.timed("covers"):
         poses = _ranked(poses, task)
-    aligned: list[Float[np.ndarray, "4 4"]] = []
     with task.timed("alignment"):
-        for pose in poses:
-            if not aligned or time.perf_counter() < end:
-                turned = align(np.linalg.inv(pose), task.scan, task.part, reach=FAR_OFF)
-                aligned.append(np.linalg.inv(turned))
+        poses = _aligned(poses, task, end)
+        poses = poses[different(poses, task.part.points, SAME * task.size, len(poses))]
     with task.timed("comparison"):
-        found = _compared(np.stack(aligned), part, task)
-    return Searched(found, task.part.voxel_size, scan.viewpoint is not None, task.seconds)
+        found = _compared(poses, task)
+    with task.timed("symmetry"):
+        found, axis = _completed(found, task, end)
+    return Searched(found, task.part.voxel_size, axis, scan.viewpoint is not None, task.seconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +128,8 @@ class _Task:
 
     part: Surface
     scan: Surface
-    scan_points: Float[np.ndarray, "n 3"]
+    fine_part: FinePart
+    fine_scan: FineScan
     part_field: Field
     scan_field: Field
     eyes: Float[np.ndarray, "e 3"]
@@ -147,7 +161,10 @@ def _prepared(part: Cloud, scan: Cloud, threads: int) -> _Task:
     )
     fields = (jax.device_put(field_of(x.tree)) for x in (a, b))
     eyes = likely_eyes(b.points, cell) if scan.viewpoint is None else scan.viewpoint[None]
-    return _Task(a, b, points, *fields, eyes, {"fields": time.perf_counter() - start})
+    fine = max(voxel_size_for(part.points, FINE_CELLS), LEAST_SPACINGS * spacing(part.points))
+    fine_part = FinePart(Tree(part.points, threads), downsample(part.points, fine), fine)
+    fine_scan = FineScan(Tree(points, threads), b.points)
+    return _Task(a, b, fine_part, fine_scan, *fields, eyes, {"fields": time.perf_counter() - start})
 
 
 def _thinned(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
@@ -200,16 +217,48 @@ def _ranked(poses: Float[np.ndarray, "k 4 4"], task: _Task) -> Float[np.ndarray,
     return poses[different(poses, task.part.points, DIFFERENT * task.size, ALIGNED)]
 
 
-def _compared(poses: Float[np.ndarray, "k 4 4"], part: Cloud, task: _Task) -> tuple[Found, ...]:
-    """Weigh aligned poses by all points, the best first, each only once."""
-    poses = poses[different(poses, task.part.points, SAME * task.size, len(poses))]
-    cell = max(voxel_size_for(part.points, FINE_CELLS), LEAST_SPACINGS * spacing(part.points))
-    fine = Tree(part.points, task.part.threads), downsample(part.points, cell), cell
-    scan = Tree(task.scan_points, task.part.threads), task.scan.points
-    covers = [cover(pose, fine, scan, task.eyes, task.part.voxel_size) for pose in poses]
-    order = np.argsort([x.distance for x in covers], kind="stable")
-    kept = different(poses[order], task.part.points, DIFFERENT * task.size, len(poses))
-    return tuple(Found(poses[k], covers[k]) for k in order[kept])
+def _aligned(poses: Float[np.ndarray, "k 4 4"], task: _Task, end: float) -> Float[np.ndarray, "m 4 4"]:
+    """Align poses while there is time, the first in any case."""
+    done: list[Float[np.ndarray, "4 4"]] = []
+    for pose in poses:
+        if not done or time.perf_counter() < end:
+            done.append(np.linalg.inv(align(np.linalg.inv(pose), task.scan, task.part, reach=FAR_OFF)))
+    return np.stack(done)
+
+
+def _compared(poses: Float[np.ndarray, "k 4 4"], task: _Task) -> tuple[Found, ...]:
+    """Weigh poses by all points, the best first."""
+    found = [
+        Found(pose, cover(pose, task.fine_part, task.fine_scan, task.eyes, task.part.voxel_size))
+        for pose in poses
+    ]
+    return tuple(sorted(found, key=lambda x: x.cover.distance))
+
+
+def _completed(found: tuple[Found, ...], task: _Task, end: float) -> tuple[tuple[Found, ...], Axis | None]:
+    """Turn the best pose about the axis that the equally good ones share, if they do.
+
+    Returns:
+        All poses that are different, the best first, and the axis if every turn about it is as good.
+    """
+    axis = shared_axis(np.stack([x.pose for x in found if is_as_good(x, found[0])]), task.size)
+    if axis is not None and time.perf_counter() < end:
+        around = turned(found[0].pose, axis)
+        more = _compared(around, task)
+        if not all(is_as_good(x, found[0]) for x in more):
+            axis, more = None, _compared(_aligned(around, task, end), task)
+        found = tuple(sorted((*found, *more), key=lambda x: x.cover.distance))
+    else:
+        axis = None
+    poses = np.stack([x.pose for x in found])
+    return tuple(
+        found[k] for k in different(poses, task.part.points, DIFFERENT * task.size, len(poses))
+    ), axis
+
+
+def is_as_good(found: Found, best: Found) -> bool:
+    """Tell whether a pose is as good as the best."""
+    return found.cover.distance <= (1 + MARGIN) * best.cover.distance
 
 
 def different(

@@ -45,7 +45,9 @@ def _pixels(
     ahead = jnp.sum(rows[:, None] * (points - eye), axis=0) / jnp.sum(rows)
     away = jnp.maximum(jnp.sqrt(jnp.sum(ahead**2)), jnp.finfo(points.dtype).tiny)
     ahead = ahead / away
-    aside = jnp.where(jnp.abs(ahead[0]) < 0.9, jnp.eye(3, dtype=points.dtype)[0], jnp.eye(3, dtype=points.dtype)[1])
+    aside = jnp.where(
+        jnp.abs(ahead[0]) < 0.9, jnp.eye(3, dtype=points.dtype)[0], jnp.eye(3, dtype=points.dtype)[1]
+    )
     right = jnp.cross(ahead, aside)
     right = right / jnp.sqrt(jnp.sum(right**2))
     along = points - eye
@@ -72,7 +74,9 @@ def likely_eyes(points: Float[np.ndarray, "n 3"], cell: float) -> Float[np.ndarr
     middle, away = (low + high) / 2, AWAY * float(np.linalg.norm(high - low))
     directions = _even_directions(DIRECTIONS)
     rows, mask = padded(points - middle)
-    count = np.asarray(_seen_from(rows, mask, (away * directions).astype(np.float32), np.float32(PIXEL * cell)))
+    count = np.asarray(
+        _seen_from(rows, mask, (away * directions).astype(np.float32), np.float32(PIXEL * cell))
+    )
     good = directions[count >= count.max() - AS_GOOD * len(points)]
     line = np.linalg.eigh(good.T @ good)[1][:, -1]
     return middle + away * np.stack([line, -line])

@@ -89,7 +89,9 @@ def sweep(
             block = lax.dynamic_slice(lattice.levels, corner, (1, SIDE, SIDE, SIDE))
             return total + block[0].astype(jnp.int32)
 
-        total = lax.fori_loop(jnp.int32(0), jnp.int32(len(points)), add, jnp.zeros((SIDE,) * 3, jnp.int32)).reshape(-1)
+        total = lax.fori_loop(
+            jnp.int32(0), jnp.int32(len(points)), add, jnp.zeros((SIDE,) * 3, jnp.int32)
+        ).reshape(-1)
         best = jnp.argmin(total).astype(jnp.int32)
         return total[best], best
 

@@ -1,4 +1,4 @@
-"""How well a part and a scan cover one another: all of the scan, and of the part what the camera could see."""
+"""How a part and a scan cover one another: all of the scan, and what the camera could see of the part."""
 
 from __future__ import annotations
 
@@ -99,10 +99,25 @@ def _covered(
     return jnp.sum(weight * (distance < near * cell)), jnp.sum(weight * jnp.minimum(distance, FAR * cell))
 
 
+class FinePart(NamedTuple):
+    """All points of a part, its cells, and the width of these [length]."""
+
+    tree: Tree
+    cells: Float[np.ndarray, "n 3"]
+    width: float
+
+
+class FineScan(NamedTuple):
+    """All points of a scan, and its cells [length]."""
+
+    tree: Tree
+    cells: Float[np.ndarray, "m 3"]
+
+
 def cover(
     pose: Float[np.ndarray, "4 4"],
-    part: tuple[Tree, Float[np.ndarray, "n 3"], float],
-    scan: tuple[Tree, Float[np.ndarray, "m 3"]],
+    part: FinePart,
+    scan: FineScan,
     eyes: Float[np.ndarray, "e 3"],
     cell: float,
 ) -> Cover:
@@ -110,22 +125,19 @@ def cover(
 
     Args:
         pose: From the part to the scan.
-        part: Its points, its cells, and the width of these [length].
-        scan: Its points, and its cells [length].
+        part, scan: The clouds.
         eyes: Where the camera may have stood, in the frame of the scan: the best counts [length].
         cell: Width that distances are measured by [length].
     """
     back = np.linalg.inv(pose)
-    here = part[0].nearest(moved(back, scan[1]))[1]
-    there = scan[0].nearest(moved(pose, part[1]))[1]
-    rows, mask = padded(part[1])
+    here = part.tree.nearest(moved(back, scan.cells))[1]
+    there = scan.tree.nearest(moved(pose, part.cells))[1]
+    rows, mask = padded(part.cells)
     found = []
     for eye in moved(back, eyes):
-        seen = np.asarray(visible(rows, mask, eye.astype(np.float32), np.float32(PIXEL * part[2])))
+        seen = np.asarray(visible(rows, mask, eye.astype(np.float32), np.float32(PIXEL * part.width)))
         far = there[seen[: len(there)]]
-        found.append((np.minimum(far, FAR * cell).mean(), np.mean(far < PART_NEAR * cell)))
+        found.append((float(np.minimum(far, FAR * cell).mean()), float(np.mean(far < PART_NEAR * cell))))
     part_distance, covered = min(found)
-    return Cover(
-        float(np.mean(here < SCAN_NEAR * cell)), float(covered), float(np.minimum(here, FAR * cell).mean()),
-        float(part_distance),
-    )  # fmt: skip
+    scan_distance = float(np.minimum(here, FAR * cell).mean())
+    return Cover(float(np.mean(here < SCAN_NEAR * cell)), covered, scan_distance, part_distance)
