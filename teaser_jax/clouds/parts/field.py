@@ -61,19 +61,18 @@ def field_of(tree: Tree) -> Field:
     return Field(level, rows, shape, low.astype(np.float32), np.float32(width))
 
 
-def voxel_of(field: Field, points: Float[Array, "... 3"]) -> Int[Array, "..."]:
+def voxel_of(field: Field, points: Float[Array, "*k 3"]) -> Int[Array, "*k"]:
     """Find the number of the voxel in which each point lies; outside of the grid, the one at its side."""
-    place = jnp.floor((points - field.low) / field.width).astype(jnp.int32)
-    return numbered(field, place)
-
-
-def numbered(field: Field, place: Int[Array, "... 3"]) -> Int[Array, "..."]:
-    """Number voxels by their places along the axes."""
-    x, y, z = (jnp.clip(place[..., k], 0, field.shape[k] - 1) for k in range(3))
+    x, y, z = (
+        jnp.clip(
+            jnp.floor((points[..., k] - field.low[k]) / field.width).astype(jnp.int32), 0, field.shape[k] - 1
+        )
+        for k in range(3)
+    )
     return (x * field.shape[1] + y) * field.shape[2] + z
 
 
-def distances(field: Field, points: Float[Array, "... 3"]) -> Float[Array, "..."]:
+def distances(field: Field, points: Float[Array, "*k 3"]) -> Float[Array, "*k"]:
     """Look up how far the cloud is, at most the reach [length]."""
     unit = field.width * np.float32(REACH / LEVELS)
     return field.level[voxel_of(field, points)].astype(jnp.float32) * unit

@@ -32,11 +32,6 @@ from teaser_jax.clouds.surface import FEW_NEIGHBOURS, Surface
 from teaser_jax.clouds.symmetry import MARGIN, Axis, shared_axis, turned
 from teaser_jax.clouds.voxel import LEAST_SPACINGS, downsample, spacing, voxel_size_for
 
-# One of 4096 rotations lies within 12 deg of any, and the rounds of alignment reach a tenth of the part.
-ROTATIONS, POINTS = 4096, 192
-SETTLED = 1024  # of the rotations, each at its best place
-WEIGHED = 256  # different ones of those
-ALIGNED = 40  # the best of those
 ON_ACCELERATOR = 256  # poses side by side
 # Cells of the part while it is searched for, and when the answers are ranked.
 CELLS, FINE_CELLS = 3000, 12_000
@@ -47,6 +42,27 @@ SAME, DIFFERENT = 0.02, 0.05  # of the size of the part: displacement on average
 LONERS, LONELY = 10, 3.0  # neighbours, and how much further than usual they are about stray points
 # What a part must reach in its own scan: see ``Searched.ok``.
 LEAST_OF_SCAN, LEAST_OF_PART = 0.9, 0.65
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How many poses a search tries, and looks at more closely.
+
+    One of 4096 rotations lies within 12 deg of any, and the alignment in the field reaches a tenth of the part.
+
+    Attributes:
+        rotations: That are tried, each at 729 places.
+        points: Of the scan that are looked up for each pose.
+        settled: Rotations that are aligned in the field, each at its best place.
+        weighed: Different poses among those that both clouds weigh.
+        aligned: The best of those, which are aligned with all cells.
+    """
+
+    rotations: int = 4096
+    points: int = 192
+    settled: int = 1024
+    weighed: int = 256
+    aligned: int = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +108,14 @@ class Searched:
         return self.knows_viewpoint and best.scan > LEAST_OF_SCAN and best.part > LEAST_OF_PART
 
 
-def search(part: Cloud, scan: Cloud, *, threads: int = 1, seconds: float | None = None) -> Searched:
+def search(
+    part: Cloud,
+    scan: Cloud,
+    *,
+    effort: Effort = Effort(),  # noqa: B008
+    threads: int = 1,
+    seconds: float | None = None,
+) -> Searched:
     """Find the poses in which a part may lie in a scan of one of its sides.
 
     Where the scan has no viewpoint, two are guessed, one on either side of it.
@@ -100,6 +123,7 @@ def search(part: Cloud, scan: Cloud, *, threads: int = 1, seconds: float | None 
     Args:
         part: The whole surface of the part.
         scan: What a camera saw of it, and little else.
+        effort: How much to try.
         threads: How many threads to ask neighbours with: they change no answer.
         seconds: When they are over, no further pose is aligned [s].
 
@@ -109,9 +133,9 @@ def search(part: Cloud, scan: Cloud, *, threads: int = 1, seconds: float | None 
     end = np.inf if seconds is None else time.perf_counter() + seconds
     task = _prepared(part, scan, threads)
     with task.timed("sweep"):
-        poses = _swept(task)
+        poses = _swept(task, effort)
     with task.timed("covers"):
-        poses = _ranked(poses, task)
+        poses = _ranked(poses, task, effort)
     with task.timed("alignment"):
         poses = _aligned(poses, task, end)
         poses = poses[different(poses, task.part.points, SAME * task.size, len(poses))]
@@ -175,17 +199,17 @@ def _thinned(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     return points[around <= LONELY * np.median(around)]
 
 
-def _swept(task: _Task) -> Float[np.ndarray, "k 4 4"]:
+def _swept(task: _Task, effort: Effort) -> Float[np.ndarray, "k 4 4"]:
     """Try all rotations at all places, and let the best settle: poses from the part to the scan."""
     cells = task.scan.points
     order = np.random.default_rng(0).permutation(len(cells))
-    some = cells[np.resize(order, POINTS)]
+    some = cells[np.resize(order, effort.points)]
     middle = some.mean(axis=0)
     some = (some - middle).astype(np.float32)
-    rotations = even_rotations(ROTATIONS).astype(np.float32)
+    rotations = even_rotations(effort.rotations).astype(np.float32)
     lattice = lattice_of(task.part_field)
     total, place = (np.asarray(x) for x in sweep(lattice, some, rotations, at_once=_at_once()))
-    best = np.argsort(total, kind="stable")[:SETTLED]
+    best = np.argsort(total, kind="stable")[: effort.settled]
     shifts = lattice.places[place[best]].astype(np.float32)
     rows, _ = padded(task.part.points)
     settled = settle(task.part_field, rows, some, rotations[best], shifts)
@@ -196,10 +220,10 @@ def _swept(task: _Task) -> Float[np.ndarray, "k 4 4"]:
     return poses
 
 
-def _ranked(poses: Float[np.ndarray, "k 4 4"], task: _Task) -> Float[np.ndarray, "m 4 4"]:
+def _ranked(poses: Float[np.ndarray, "k 4 4"], task: _Task, effort: Effort) -> Float[np.ndarray, "m 4 4"]:
     """Keep of many poses the different ones, and of these the ones that cover best, the best first."""
-    poses = poses[different(poses, task.part.points, SAME * task.size, WEIGHED)]
-    rows = np.resize(poses, (WEIGHED, 4, 4))  # one program
+    poses = poses[different(poses, task.part.points, SAME * task.size, effort.weighed)]
+    rows = np.resize(poses, (effort.weighed, 4, 4))  # one program
     rotations = np.swapaxes(rows[:, :3, :3], 1, 2)
     shifts = -np.einsum("kij,kj->ki", rotations, rows[:, :3, 3])
     covers = quick_covers(
@@ -214,7 +238,7 @@ def _ranked(poses: Float[np.ndarray, "k 4 4"], task: _Task) -> Float[np.ndarray,
         at_once=_at_once(),
     )
     poses = poses[np.argsort(np.asarray(covers.distance)[: len(poses)], kind="stable")]
-    return poses[different(poses, task.part.points, DIFFERENT * task.size, ALIGNED)]
+    return poses[different(poses, task.part.points, DIFFERENT * task.size, effort.aligned)]
 
 
 def _aligned(poses: Float[np.ndarray, "k 4 4"], task: _Task, end: float) -> Float[np.ndarray, "m 4 4"]:

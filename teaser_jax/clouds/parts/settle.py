@@ -45,14 +45,18 @@ def settle(
     def one(start: tuple[Array, Array]) -> tuple[Array, Array]:
         def again(k: Int[Array, ""], pose: tuple[Array, Array]) -> tuple[Array, Array]:
             rotation, shift = pose
-            here = so3.rotate(rotation, points) + shift
+            here = so3.rotate(rotation, points) + shift[None]
             there = cells[field.nearest[voxel_of(field, here)]]
             squared = jnp.sum((here - there) ** 2, axis=1) / reaches[k] ** 2
             weight = jnp.maximum(1 - squared, 0) ** 2 + jnp.float32(SOME)
             weight = weight / jnp.sum(weight)
             mean, goal = weight @ points, weight @ there
             spread = jnp.einsum(
-                "n,ni,nj->ij", weight, there - goal, points - mean, precision=lax.Precision.HIGHEST
+                "n,ni,nj->ij",
+                weight,
+                there - goal[None],
+                points - mean[None],
+                precision=lax.Precision.HIGHEST,
             )
             rotation = so3.nearest_rotation(spread)
             return rotation, goal - so3.rotate(rotation, mean[None])[0]

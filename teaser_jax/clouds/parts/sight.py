@@ -32,7 +32,7 @@ def visible(
         pixel: Width of its pixels there [length].
     """
     number = _pixels(points, mask, eye, pixel)
-    distance = jnp.where(mask, jnp.sqrt(jnp.sum((points - eye) ** 2, axis=1)), jnp.inf)
+    distance = jnp.where(mask, jnp.sqrt(jnp.sum((points - eye[None]) ** 2, axis=1)), jnp.inf)
     nearest = jnp.full(PIXELS**2, jnp.inf, points.dtype).at[number].min(distance)
     return mask & (distance < nearest[number] + BEHIND * pixel)
 
@@ -42,7 +42,7 @@ def _pixels(
 ) -> Int[Array, " n"]:
     """Find the pixel in which a camera sees each point."""
     rows = mask.astype(points.dtype)
-    ahead = jnp.sum(rows[:, None] * (points - eye), axis=0) / jnp.sum(rows)
+    ahead = jnp.sum(rows[:, None] * (points - eye[None]), axis=0) / jnp.sum(rows)
     away = jnp.maximum(jnp.sqrt(jnp.sum(ahead**2)), jnp.finfo(points.dtype).tiny)
     ahead = ahead / away
     aside = jnp.where(
@@ -50,10 +50,11 @@ def _pixels(
     )
     right = jnp.cross(ahead, aside)
     right = right / jnp.sqrt(jnp.sum(right**2))
-    along = points - eye
-    depth = jnp.maximum(jnp.sum(along * ahead, axis=1), 1e-3 * away)
+    along = points - eye[None]
+    depth = jnp.maximum(jnp.sum(along * ahead[None], axis=1), 1e-3 * away)
     place = [
-        jnp.floor(jnp.sum(along * axis, axis=1) / depth * (away / pixel)).astype(jnp.int32) + PIXELS // 2
+        jnp.floor(jnp.sum(along * axis[None], axis=1) / depth * (away / pixel)).astype(jnp.int32)
+        + PIXELS // 2
         for axis in (right, jnp.cross(ahead, right))
     ]
     x, y = (jnp.clip(k, 0, PIXELS - 1) for k in place)

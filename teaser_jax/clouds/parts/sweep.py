@@ -48,10 +48,10 @@ class Lattice(NamedTuple):
 @jax.jit
 def lattice_of(field: Field) -> Lattice:
     """Cut the field of a part for a sweep."""
-    size = field.shape * field.width
+    size = field.shape.astype(jnp.float32) * field.width
     middle, width = field.low + size / 2, size / LIVE
-    steps = (jnp.arange(ALONG, dtype=jnp.float32) - np.float32((ALONG - 1) / 2))[:, None] * width
-    x, y, z = (middle[k] + steps[:, k] for k in range(3))
+    steps = jnp.arange(ALONG, dtype=jnp.float32) - np.float32((ALONG - 1) / 2)
+    x, y, z = (middle[k] + steps * width[k] for k in range(3))
     grid = jnp.stack(jnp.meshgrid(x, y, z, indexing="ij"), axis=-1)
     levels = field.level[voxel_of(field, grid)]
     cut = levels.reshape((ALONG // STEP, STEP) * 3).transpose(1, 3, 5, 0, 2, 4)
@@ -78,7 +78,7 @@ def sweep(
     first = ALONG // 2 - (SIDE // 2) * STEP  # voxel of the first place of a point in the middle
 
     def one(rotation: Float[Array, "3 3"]) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        turned = jnp.matmul(points, rotation.T, precision=lax.Precision.HIGHEST) / lattice.width
+        turned = jnp.matmul(points, rotation.T, precision=lax.Precision.HIGHEST) / lattice.width[None]
         voxel = jnp.floor(turned + np.float32(0.5)).astype(jnp.int32) + first
         part = voxel % STEP
         start = jnp.clip(voxel // STEP, 0, ALONG // STEP - SIDE)

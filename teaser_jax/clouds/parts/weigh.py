@@ -78,10 +78,10 @@ def quick_covers(
 
     def one(pose: tuple[Array, Array]) -> Cover:
         rotation, shift = pose
-        here = distances(part_field, so3.rotate(rotation, scan.points) + shift)
-        back = distances(scan_field, so3.rotate(rotation.T, part.points - shift))
+        here = distances(part_field, so3.rotate(rotation, scan.points) + shift[None])
+        back = distances(scan_field, so3.rotate(rotation.T, part.points - shift[None]))
         near, mean = _covered(here, scan.mask, SCAN_NEAR, cell)
-        seen_from = so3.rotate(rotation, eyes) + shift
+        seen_from = so3.rotate(rotation, eyes) + shift[None]
         seen = jax.vmap(lambda eye: visible(part.points, part.mask, eye, PIXEL * cell))(seen_from)
         covers = jax.vmap(lambda mask: _covered(back, mask, PART_NEAR, cell))(seen)
         best = jnp.argmin(covers[1])
@@ -96,7 +96,8 @@ def _covered(
     """Compute which share of some cells is covered, and their mean distance."""
     weight = mask.astype(distance.dtype)
     weight = weight / jnp.maximum(jnp.sum(weight), 1)
-    return jnp.sum(weight * (distance < near * cell)), jnp.sum(weight * jnp.minimum(distance, FAR * cell))
+    share = jnp.sum(jnp.where(distance < near * cell, weight, 0))
+    return share, jnp.sum(weight * jnp.minimum(distance, FAR * cell))
 
 
 class FinePart(NamedTuple):
