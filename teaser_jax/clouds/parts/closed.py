@@ -19,8 +19,8 @@ ASKED = 10_000  # points that tell
 PIXELS = 64  # along the diagonal, or as many as the sampling carries
 THICK = 1.5  # pixels between a front and its back
 # Scans of parts reach 0.06, and 0.21 where faces are seen at a flat angle; scans of a bunny 0.20, of rooms
-# 0.33, streets 0.03. Models have 0.33 (thin boards) and 0.6 - 0.95, empty rooms 0.93. Two scans of one bunny or
-# one room are within 0.10 of one another.
+# 0.33, streets 0.03. Models have 0.33 (thin boards) and 0.6 - 0.95, empty rooms 0.93. Two scans of one bunny
+# or one room are within 0.10 of one another.
 MOST_OF_SCAN, LEAST_AHEAD = 0.25, 0.20
 MOST_LARGER = 1.15  # a scan than its part, with errors
 

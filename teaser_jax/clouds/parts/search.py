@@ -48,7 +48,8 @@ LEAST_OF_SCAN, LEAST_OF_PART = 0.9, 0.65
 class Effort:
     """How many poses a search tries, and looks at more closely.
 
-    One of 4096 rotations lies within 12 deg of any, and the alignment in the field reaches a tenth of the part.
+    One of 4096 rotations lies within 12 deg of any, and the alignment in the field reaches a tenth of the
+    part.
 
     Attributes:
         rotations: That are tried, each at 729 places.
@@ -112,7 +113,7 @@ def search(
     part: Cloud,
     scan: Cloud,
     *,
-    effort: Effort = Effort(),  # noqa: B008
+    effort: Effort = Effort(),
     threads: int = 1,
     seconds: float | None = None,
 ) -> Searched:
