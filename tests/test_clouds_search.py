@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -25,13 +26,14 @@ from teaser_jax.clouds.parts.sight import likely_eyes, visible
 from teaser_jax.clouds.parts.sweep import lattice_of, sweep
 from teaser_jax.clouds.parts.turns import even_rotations
 from teaser_jax.clouds.sizes import padded
+from teaser_jax.clouds.symmetry import STEPS, Axis, shared_axis, turned
 from teaser_jax.clouds.trust.pairing import moved
 from teaser_jax.synthetic.scans import partial_scan
 
 F32 = np.float32
 VIEW = np.array([0.5, 0.3, 0.8])
 # Programs are not optimised in tests, and these parts are easy.
-EASY = Effort(rotations=800, points=64, settled=200, weighed=100, aligned=24)
+EASY = Effort(rotations=600, points=64, settled=128, weighed=64, aligned=16)
 DISTANCE = 6.0  # of the camera, for parts two units long
 SQUARE = box([-1, -0.25, -0.25], [1, 0.25, 0.25])
 
@@ -67,9 +69,9 @@ def scanned(name: str, knows_viewpoint: bool = True) -> tuple[Cloud, Cloud, np.n
     return part, dst, truth
 
 
-@pytest.fixture(scope="module")
-def found() -> dict[str, Searched]:
-    return {name: search(*scanned(name)[:2], effort=EASY) for name in PARTS}
+@cache
+def found(name: str) -> Searched:
+    return search(*scanned(name)[:2], effort=EASY)
 
 
 def off(pose: np.ndarray, truth: np.ndarray, points: np.ndarray) -> float:
@@ -79,7 +81,7 @@ def off(pose: np.ndarray, truth: np.ndarray, points: np.ndarray) -> float:
 @pytest.mark.parametrize("knows_viewpoint", [True, False])
 def test_a_part_is_found_in_its_scan(knows_viewpoint: bool):
     part, scan, truth = scanned("block", knows_viewpoint)
-    answer = search(part, scan, effort=EASY)
+    answer = found("block") if knows_viewpoint else search(part, scan, effort=EASY)
     assert off(answer.found[0].pose, truth, part.points) < 0.05  # of 2.4, with errors of 0.01
     assert len(answer.equivalent) == 1
     assert answer.axis is None
@@ -87,7 +89,7 @@ def test_a_part_is_found_in_its_scan(knows_viewpoint: bool):
     assert answer.ok == answer.knows_viewpoint == knows_viewpoint
 
 
-def test_all_poses_of_a_square_rod_are_found(found: dict[str, Searched]):
+def test_all_poses_of_a_square_rod_are_found():
     part, _, truth = scanned("square")
     turns = [np.diag([a, b, a * b, 1.0]) for a in (1, -1) for b in (1, -1)]
     turns += [
@@ -97,34 +99,34 @@ def test_all_poses_of_a_square_rod_are_found(found: dict[str, Searched]):
     ]
     about = np.eye(4)
     about[:3, 3] = part.origin
-    poses = [x.pose for x in found["square"].equivalent]
+    poses = [x.pose for x in found("square").equivalent]
     assert len(poses) == 8
     for turn in turns:
         other = truth @ np.linalg.inv(about) @ turn @ about
         assert min(off(pose, other, part.points) for pose in poses) < 0.1
-    assert found["square"].axis is None
+    assert found("square").axis is None
 
 
-def test_a_round_rod_has_an_axis(found: dict[str, Searched]):
+def test_a_round_rod_has_an_axis():
     part, _, _ = scanned("rod")
-    axis = found["rod"].axis
+    axis = found("rod").axis
     assert axis is not None
     assert abs(axis.direction[0]) > np.cos(np.radians(2))
     point = axis.point + part.origin
     assert np.linalg.norm(point - (point @ axis.direction) * axis.direction) < 0.02
 
 
-def test_a_wrong_part_is_not_taken_for_the_right_one(found: dict[str, Searched]):
+def test_a_wrong_part_is_not_taken_for_the_right_one():
     scan = scanned("block")[1]
     wrong = search(scanned("rod")[0], scan, effort=EASY)
     assert not wrong.ok
-    assert wrong.found[0].cover.distance > 1.5 * found["block"].found[0].cover.distance
+    assert wrong.found[0].cover.distance > 1.5 * found("block").found[0].cover.distance
 
 
-def test_same_clouds_same_bits(found: dict[str, Searched]):
+def test_same_clouds_same_bits():
     part, scan, _ = scanned("square")
     again = search(part, scan, effort=EASY, threads=2)
-    first = [x.pose.tobytes() for x in found["square"].found]
+    first = [x.pose.tobytes() for x in found("square").found]
     assert [x.pose.tobytes() for x in again.found] == first
 
 
@@ -134,9 +136,9 @@ def test_a_search_ends_when_its_time_is_over():
     assert len(search(part, scan, effort=EASY, seconds=0.0).found) == 1
 
 
-def test_found_poses_are_different(found: dict[str, Searched]):
+def test_found_poses_are_different():
     part, _, _ = scanned("block")
-    poses = [x.pose for x in found["block"].found]
+    poses = [x.pose for x in found("block").found]
     size = np.linalg.norm(np.ptp(part.points, axis=0))
     for k, pose in enumerate(poses):
         for other in poses[:k]:
@@ -144,6 +146,36 @@ def test_found_poses_are_different(found: dict[str, Searched]):
                 np.linalg.norm(moved(pose, part.points) - moved(other, part.points), axis=1).mean()
                 > 0.04 * size
             )
+
+
+AXIS = Axis(np.array([0.3, 0.0, -0.1]), np.array([0.0, 1.0, 0.0]))
+
+
+def test_poses_that_turn_about_an_axis_share_it():
+    pose = random_pose(np.random.default_rng(2)).matrix
+    half = np.diag([1.0, -1.0, -1.0, 1.0])  # turns the axis round
+    poses = turned(np.array(pose), AXIS)
+    assert len(poses) == STEPS
+    found = shared_axis(np.concatenate([poses[[0, 2, 5, 11]], poses[:2] @ half]), 1.0)
+    assert found is not None
+    assert abs(found.direction @ AXIS.direction) == pytest.approx(1, abs=1e-9)
+    np.testing.assert_allclose(found.point, AXIS.point, atol=1e-9)
+    np.testing.assert_allclose(
+        moved(poses[5], AXIS.point[None]), moved(poses[0], AXIS.point[None]), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("rows", [[0], [0, 3], [0, 8]])
+def test_two_poses_share_no_axis_worth_a_look(rows: list[int]):
+    assert shared_axis(turned(np.eye(4), AXIS)[rows], 1.0) is None
+
+
+def test_poses_that_differ_by_shifts_or_at_random_share_no_axis():
+    rng = np.random.default_rng(3)
+    assert shared_axis(np.stack([np.array(random_pose(rng).matrix) for _ in range(5)]), 1.0) is None
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, 0, 3] = np.arange(5)
+    assert shared_axis(poses, 1.0) is None
 
 
 def test_bodies_are_told_from_scans():

@@ -184,12 +184,14 @@ def _prepared(part: Cloud, scan: Cloud, threads: int) -> _Task:
         Surface(downsample(x, cell), cell, threads=threads, count=FEW_NEIGHBOURS)
         for x in (part.points, points)
     )
-    fields = (jax.device_put(field_of(x.tree)) for x in (a, b))
+    fields = [jax.device_put(field_of(x.tree)) for x in (a, b)]
     eyes = likely_eyes(b.points, cell) if scan.viewpoint is None else scan.viewpoint[None]
     fine = max(voxel_size_for(part.points, FINE_CELLS), LEAST_SPACINGS * spacing(part.points))
     fine_part = FinePart(Tree(part.points, threads), downsample(part.points, fine), fine)
     fine_scan = FineScan(Tree(points, threads), b.points)
-    return _Task(a, b, fine_part, fine_scan, *fields, eyes, {"fields": time.perf_counter() - start})
+    return _Task(
+        a, b, fine_part, fine_scan, fields[0], fields[1], eyes, {"fields": time.perf_counter() - start}
+    )
 
 
 def _thinned(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
