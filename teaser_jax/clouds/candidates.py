@@ -131,6 +131,15 @@ class Search:
         src, dst = pair.surfaces(CELLS, MOST_CELLS)
         with pair.timed("alignment"):
             aligned = align(align(pair.centred(pose), src, dst, reach=3.0), src, dst)
+        return self.weighed(aligned, found_by, registration)
+
+    def weighed(
+        self, aligned: Float[np.ndarray, "4 4"], found_by: str, registration: Registration | None
+    ) -> Candidate:
+        """Tell how well the clouds fit in a pose between their middles."""
+        pair = self.pair
+        src, dst = pair.surfaces(CELLS, MOST_CELLS)
+        with pair.timed("alignment"):
             here, back = both_ways(aligned, src, dst)
         fit, cells = min(here.fit, back.fit), min(here.count, back.count)
         return Candidate(pair.given(aligned), fit, cells, found_by, registration)

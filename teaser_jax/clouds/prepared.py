@@ -13,11 +13,10 @@ from jaxtyping import Float
 from teaser_jax.clouds.cloud import Cloud, as_cloud
 from teaser_jax.clouds.neighbours import Tree
 from teaser_jax.clouds.surface import Surface
-from teaser_jax.clouds.voxel import POINTS_A_CELL, downsample, spacing, voxel_size_for
+from teaser_jax.clouds.voxel import LEAST_SPACINGS, POINTS_A_CELL, downsample, spacing, voxel_size_for
 from teaser_jax.ground.checks import whole_number
 
 STEPS = 4  # widths of cells that a kept cloud is cut into, between one and twice as wide
-LEAST_SPACINGS = 1.6  # of the sampling: cells finer than this hold one point each
 THINNED, ROUGHLY = 40_000, 20_000  # points that tell how far they lie apart; how wide cells are, about
 FINER = 4.0  # times finer are cells whose means stand for the points, where cells are counted
 LADDER_CELLS = 6000  # of the step that all others are counted from

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,8 +16,10 @@ from teaser_jax.clouds.candidates import MOST_CELLS, Candidate, Search, candidat
 from teaser_jax.clouds.cloud import as_cloud
 from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.pair import Pair
+from teaser_jax.clouds.parts.answer import part_answer
 from teaser_jax.clouds.prepared import Prepared, threads_or_all
 from teaser_jax.clouds.registration import CloudRegistration
+from teaser_jax.clouds.symmetry import Axis
 from teaser_jax.clouds.trust.judge import CELLS, Judged, Verdict, judge
 from teaser_jax.clouds.trust.pairing import moved
 from teaser_jax.clouds.trust.rivals import Guess
@@ -111,10 +114,10 @@ def register_clouds(
     with _shown(progress) as show:
         ask = _Ask(refine, tolerance, initial_error is not None, show)
         if initial is None:
-            found, judged = _searched(search, ask)
+            outcome = _with_part(search, ask, *_searched(search, ask))
         else:
-            found, judged = _near(search, _guess(pair, initial, initial_error), ask)
-    return _answer(search, clouds, ask, found, judged)
+            outcome = _near(search, _guess(pair, initial, initial_error), ask)
+    return _answer(search, clouds, ask, outcome)
 
 
 class _Ask(NamedTuple):
@@ -124,6 +127,22 @@ class _Ask(NamedTuple):
     tolerance: float | None
     is_certain: bool  # that the initial pose is no further off than was said
     show: Callable[[str], None]
+
+
+class _Outcome(NamedTuple):
+    """What the work led to.
+
+    Attributes:
+        found: All poses, best first.
+        judged: The first of them; None: there is none.
+        equivalent: Poses as good as the first; None: those that the verdict knows.
+        axis: About which the source may be turned, in the frame of the target about its middle.
+    """
+
+    found: list[Candidate]
+    judged: Judged | None
+    equivalent: list[Pose] | None = None
+    axis: Axis | None = None
 
 
 def _searched(search: Search, ask: _Ask) -> tuple[list[Candidate], Judged | None]:
@@ -142,7 +161,23 @@ def _searched(search: Search, ask: _Ask) -> tuple[list[Candidate], Judged | None
     return found, judged
 
 
-def _near(search: Search, guess: Guess, ask: _Ask) -> tuple[list[Candidate], Judged]:
+def _with_part(search: Search, ask: _Ask, found: list[Candidate], judged: Judged | None) -> _Outcome:
+    """Where matches lead to nothing, look for a part in a scan of it, whose pose counts if it is found."""
+    pair = search.pair
+    if judged is not None and judged.verdict.doubt is None:
+        return _Outcome(found, judged)
+    ask.show("looking for a part in its scan")
+    part = part_answer(pair, search.seconds_left)
+    lost = judged is None or judged.verdict.status == Status.NO_CONSENSUS
+    if part is None or (part.verdict.doubt == "part" and not lost):
+        return _Outcome(found, judged)
+    others = [pair.given(x) for x in part.poses[1:]]
+    best = search.weighed(part.poses[0], "all poses of a part", None)
+    there = judge(part.poses[0], pair, refine=None)
+    return _Outcome([best, *found], replace(there, verdict=part.verdict), others, part.axis)
+
+
+def _near(search: Search, guess: Guess, ask: _Ask) -> _Outcome:
     """Look for a pose near a guess; if the clouds draw it further away than it may be off, the guess stays.
 
     The surfaces draw it from as far as it may be off, then from half of that, and so on.
@@ -158,7 +193,7 @@ def _near(search: Search, guess: Guess, ask: _Ask) -> tuple[list[Candidate], Jud
     if np.linalg.norm(moved(pose, some) - moved(guess.pose, some), axis=1).mean() > guess.error:
         pose = guess.pose
     found = [search.compared(pair.given(pose), "the initial pose", None)]
-    return found, _judge(found, pair, ask, guess)
+    return _Outcome(found, _judge(found, pair, ask, guess))
 
 
 def _judge(found: list[Candidate], pair: Pair, ask: _Ask, guess: Guess | None = None) -> Judged:
@@ -170,27 +205,25 @@ def _judge(found: list[Candidate], pair: Pair, ask: _Ask, guess: Guess | None = 
 
 
 def _answer(
-    search: Search,
-    clouds: tuple[Prepared, Prepared],
-    ask: _Ask,
-    found: list[Candidate],
-    judged: Judged | None,
+    search: Search, clouds: tuple[Prepared, Prepared], ask: _Ask, outcome: _Outcome
 ) -> CloudRegistration:
     """Write what was found in the frames as given."""
-    pair, (src, dst) = search.pair, clouds
+    pair, (src, dst), judged, axis = search.pair, clouds, outcome.judged, outcome.axis
     evidence, verdict = None, Verdict(Status.NO_CONSENSUS, "matches")
     equivalent: tuple[Pose, ...] = ()
     pose = Pose(np.eye(3), np.zeros(3), np.float64(pair.scale))
     if judged is not None:
         pose, evidence, verdict = pair.given(judged.pose), judged.evidence, judged.verdict
-        equivalent = tuple(pair.given(x) for x in evidence.rivals.poses)
+        rivals = (pair.given(x) for x in evidence.rivals.poses)
+        equivalent = () if verdict.doubt is None else tuple(outcome.equivalent or rivals)
     return CloudRegistration(
         pose=pose,
         status=verdict.status,
         doubt=verdict.doubt,
         evidence=evidence,
-        candidates=tuple(found),
+        candidates=tuple(outcome.found),
         equivalent=equivalent,
+        axis=None if axis is None else axis._replace(point=axis.point + pair.dst.cloud.origin),
         src=src.cloud,
         dst=dst.cloud,
         tolerance=ask.tolerance,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from teaser_jax.clouds.candidates import Candidate
 from teaser_jax.clouds.cloud import Cloud
+from teaser_jax.clouds.symmetry import Axis
 from teaser_jax.clouds.trust.judge import LEAST_VISIBLE, Doubt, Evidence
 from teaser_jax.clouds.trust.observability import Motion
 from teaser_jax.clouds.words import advice, summary
@@ -29,7 +30,8 @@ class CloudRegistration:
         doubt: Which question the pose failed, in a word; None: none. ``advice`` says more.
         evidence: What speaks for the pose and against it, in numbers; None: no pose was found.
         candidates: All poses that were found, best first.
-        equivalent: Other poses in which the overlap fits nearly as well.
+        equivalent: Other poses in which the overlap fits nearly as well, and which nothing rules out.
+        axis: About which the source may be turned by any angle, in the target frame; None: there is none.
         src, dst: The clouds as read, with what was left out of them.
         tolerance: How far points of the overlap might be off, as asked for; None: two voxels [length].
         ended_early: Whether the time was over before all ways to match were tried.
@@ -42,6 +44,7 @@ class CloudRegistration:
     evidence: Evidence | None
     candidates: tuple[Candidate, ...]
     equivalent: tuple[Pose, ...]
+    axis: Axis | None
     src: Cloud
     dst: Cloud
     tolerance: float | None

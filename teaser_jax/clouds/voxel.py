@@ -13,6 +13,7 @@ MOST_CELLS = 1 << 20  # along one axis, each way: what the library can number
 ASKED = 2000  # points whose nearest neighbour tells how densely a cloud is sampled
 NEAR_ENOUGH = 0.03  # of the number of cells that is wanted
 ROUNDS = 12
+LEAST_SPACINGS = 1.6  # of the sampling: cells finer than this hold one point each
 POINTS_A_CELL = 3  # at the least, or normals mean nothing
 
 

@@ -57,6 +57,11 @@ def _of_free(result: CloudRegistration, e: Evidence) -> str:
 
 def _of_rival(result: CloudRegistration, e: Evidence) -> str:
     count = len(result.equivalent)
+    if result.axis is not None:
+        axis = ", ".join(f"{x:.2f}" for x in result.axis.direction)
+        return (
+            f"The part is round: any turn about the axis ({axis}) through its middle fits as well (see axis)."
+        )
     others = f"{count} other pose{'s' * (count > 1)} (see equivalent)" if count else "another pose"
     return (
         f"The clouds fit as well in {others}, so no one can tell which is right: give what tells them apart, "
@@ -79,9 +84,24 @@ def _of_tolerance(result: CloudRegistration, e: Evidence) -> str:
     )
 
 
+def _of_part(result: CloudRegistration, e: Evidence) -> str:
+    return (
+        "One cloud is a body and the other a scan of one side, and no pose was found in which the scan lies "
+        "on the body and shows what a camera would see of it: they may not be of one object, or the scan holds "
+        "other things, too (crop leaves them out)."
+    )
+
+
+def _of_viewpoint(result: CloudRegistration, e: Evidence) -> str:
+    return (
+        "The scan lies on the body, and which of its sides a camera could see decides the pose: tell where "
+        "it stood, with src_viewpoint or dst_viewpoint."
+    )
+
+
 _OF_DOUBT = {
     "cells": _of_cells, "fit": _of_fit, "free": _of_free, "rival": _of_rival, "own": _of_own,
-    "tolerance": _of_tolerance,
+    "tolerance": _of_tolerance, "part": _of_part, "viewpoint": _of_viewpoint,
 }  # fmt: skip
 
 

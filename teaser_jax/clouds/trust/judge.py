@@ -78,7 +78,9 @@ class Evidence:
         return self.seen.displacement(self.residual)
 
 
-Doubt: TypeAlias = Literal["matches", "cells", "fit", "free", "rival", "own", "tolerance"]
+Doubt: TypeAlias = Literal[
+    "matches", "cells", "fit", "free", "rival", "own", "tolerance", "part", "viewpoint"
+]
 
 
 class Verdict(NamedTuple):
@@ -87,7 +89,8 @@ class Verdict(NamedTuple):
     "matches": there is no pose, as no points look alike; "cells": too few of them fit; "fit": too small a
     part of the overlap; "free": a motion that the normals do not see; "rival": another pose explains as much;
     "own": too little is explained by this pose alone; "tolerance": it holds, and less precisely than asked
-    for.
+    for; "part": a part is not what was scanned, or not found; "viewpoint": it is, if the camera stood where
+    the scan suggests.
     """
 
     status: Status
