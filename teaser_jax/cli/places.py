@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from teaser_jax.cli.endings import BadInput
+from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.ground.io import replacing
 from teaser_jax.register import Registration
 
@@ -56,11 +57,35 @@ def check_matplotlib() -> None:
         raise BadInput("pictures need matplotlib: pip install 'teaser-jax[viz]'") from None
 
 
+def check_plotly() -> None:
+    """Raise BadInput if no page can be written."""
+    try:
+        import plotly.graph_objects  # noqa: F401
+    except ImportError:
+        raise BadInput("pages need plotly: pip install 'teaser-jax[viz]'") from None
+
+
 def draw(path: Path, src: np.ndarray, dst: np.ndarray, result: Registration) -> None:
     """Write the picture of an answer."""
     from teaser_jax.plots import plot_registration
 
     plot_registration(src, dst, result).savefig(path)
+
+
+def draw_clouds(path: Path, result: CloudRegistration) -> None:
+    """Write the picture of an answer to two clouds, whole or not at all."""
+    from teaser_jax.plots import plot
+
+    with writing(path) as partial:
+        plot(result).savefig(partial)
+
+
+def write_page(path: Path, result: CloudRegistration, title: str) -> None:
+    """Write the page of an answer to two clouds, whole or not at all."""
+    from teaser_jax.plots import write_view
+
+    with failures_named(path):
+        write_view(path, result, title=title)
 
 
 @contextmanager

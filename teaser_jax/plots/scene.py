@@ -21,8 +21,8 @@ SATURATED = 2.0  # voxels between clouds from which on the color stays the same:
 MOST_RIVALS = 3
 FEWEST = 10  # points of an overlap that has a direction
 APART = 1.15  # reaches between the middles of two clouds that stand side by side
-# Of a distance, from touching to two voxels: red and green would be one color to many eyes, these are not.
-RAMP = ("#1f8a8c", "#e0b23a", "#c8443b")
+# Of a distance, from touching to two voxels: darker and redder, and to no eye the blue of the target.
+RAMP = ("#f0bf3a", "#e2702c", "#8e1b45")
 ALONE = "#8d939d"  # a point without a partner
 
 

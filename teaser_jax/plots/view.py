@@ -1,11 +1,12 @@
 """A page with an answer to two clouds that a browser turns: one file, which asks no network for anything.
 
-plotly draws it through WebGL. Points are float32 about the middle of the target, and squares of two pixels:
-two triangles each, where a disk has dozens.
+plotly draws it through WebGL. Points are float32 about the middle of the target, and squares: two triangles
+each, where a disk has dozens and takes four times as long.
 """
 
 from __future__ import annotations
 
+import json
 from html import escape
 from pathlib import Path
 from string import Template
@@ -20,9 +21,9 @@ from teaser_jax.plots.scene import ALONE, RAMP, SATURATED, Laid, Scene, scene_of
 from teaser_jax.plots.style import BAD, DST, GOOD, SRC
 
 MOST_POINTS = 50_000  # of each cloud
-MOST_LINES = 1000  # right and wrong ones each
-POINT, LINE = 2.0, 1.5  # pixels
-FAR = 1.9  # of the eye from the middle, in widths of the scene
+MOST_LINES = 300  # right and wrong ones each
+POINT, LINE = 0.7, 1.5  # about three pixels, and one
+FAR = 1.15  # of the eye from the middle, in diagonals of what is shown: all of it can be seen
 GRAY = "#8a909a"  # of axes: it can be read on white and on black
 SIDES = {"oblique": (0.0, -0.8, 0.7), "above": (0.0, 0.0, 1.0), "side": (0.0, -1.0, 0.0)}  # right, back, up
 
@@ -41,6 +42,18 @@ class Layer(NamedTuple):
     color: str
     traces: tuple[dict[str, Any], ...]
     visible: bool
+
+    @property
+    def box(self) -> Float[np.ndarray, "2 3"]:
+        """The lower and the upper corner around it [length]."""
+        points = np.array([np.concatenate([trace[axis] for trace in self.traces]) for axis in "xyz"])
+        return np.stack([np.nanmin(points, axis=1), np.nanmax(points, axis=1)]).astype(float)
+
+
+AXIS = {
+    "showbackground": False, "showspikes": False, "showgrid": False, "zeroline": False, "showline": True,
+    "color": GRAY, "linecolor": GRAY, "tickfont": {"size": 10}, "nticks": 6,
+}  # fmt: skip
 
 
 def write_view(path: str | Path, result: CloudRegistration, *, title: str = "Two clouds") -> Path:
@@ -68,9 +81,9 @@ def view(result: CloudRegistration, *, title: str = "Two clouds") -> str:
     """Make a page that shows an answer in three dimensions, with the words that ``print`` writes beside it.
 
     The target, the source before (beside the target, turned as given) and after, up to three
-    ``equivalent`` poses, and the matches have a button each. Colors after are those of ``plot_clouds``. Of each
-    cloud 50 000 points are drawn at most, spread evenly. The page is about 5 MB of program and 16 bytes for
-    each point of each layer; it loads nothing, and its own policy forbids it to.
+    ``equivalent`` poses, and the matches have a button each. Colors after are those of ``plot_clouds``. Of
+    each cloud 50 000 points are drawn at most, spread evenly. The page has 5 MB of program and 16 to 22 bytes
+    for each point of each layer; it loads nothing, and its own policy forbids it to.
 
     Args:
         result: The answer of ``register_clouds``.
@@ -92,7 +105,7 @@ def view(result: CloudRegistration, *, title: str = "Two clouds") -> str:
     return Template(PAGE).substitute(
         title=escape(title),
         verdict="ok" if result.ok else "bad",
-        words=escape(repr(result)),
+        words="".join(f"<span>{escape(line)}</span>" for line in repr(result).splitlines()),
         buttons="\n".join(_buttons(layers)),
         sides="\n".join(_sides(scene.axes)),
         colors=_legend(scene),
@@ -126,15 +139,18 @@ def _figure(layers: list[Layer], scene: Scene) -> Any:
     for layer in layers:
         for trace in layer.traces:
             figure.add_trace(graph.Scatter3d(**trace, name=layer.name, visible=layer.visible))
-    axis = {
-        "showbackground": False, "showspikes": False, "gridcolor": "rgba(138,144,154,0.25)", "color": GRAY,
-        "zeroline": False, "title": {"font": {"size": 12}}, "tickfont": {"size": 10}, "nticks": 6,
-    }  # fmt: skip
+    boxes = np.stack([layer.box for layer in layers if layer.visible])
+    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    ratio = (high - low) / np.linalg.norm(high - low)  # equal axes, one diagonal wide
+    axes = {
+        f"{name}axis": AXIS | {"title": {"text": name}, "range": [low[k], high[k]]}
+        for k, name in enumerate("xyz")
+    }
     figure.update_layout(
         margin=dict.fromkeys("lrtb", 0), paper_bgcolor="rgba(0,0,0,0)", showlegend=False, hovermode=False,
         uirevision="kept", scene={
-            "aspectmode": "data", "dragmode": "orbit", "bgcolor": "rgba(0,0,0,0)",
-            "camera": _camera(scene.axes, "oblique"), **{f"{name}axis": axis for name in "xyz"},
+            "aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio, strict=True)), "dragmode": "orbit",
+            "bgcolor": "rgba(0,0,0,0)", "camera": _camera(scene.axes, "oblique"), **axes,
         },
     )  # fmt: skip
     return figure
@@ -179,24 +195,21 @@ def _camera(axes: Float[np.ndarray, "3 3"], side: str) -> dict[str, Any]:
 
 
 def _buttons(layers: list[Layer]) -> list[str]:
-    """Write a button for each layer, which knows the traces that it shows."""
+    """Write a button for each layer, which knows the traces that it shows and the box around them."""
     ends = np.cumsum([0, *(len(layer.traces) for layer in layers)])
     return [
-        f'<button data-traces="{list(range(low, high))}" aria-pressed="{str(layer.visible).lower()}">'
-        f'<i style="background:{layer.color}"></i>{escape(layer.name)}</button>'
+        f'<button data-traces="{list(range(low, high))}" data-box="{layer.box.tolist()}" '
+        f'aria-pressed="{str(layer.visible).lower()}"><i style="background:{layer.color}"></i>'
+        f"{escape(layer.name)}</button>"
         for low, high, layer in zip(ends[:-1], ends[1:], layers, strict=True)
     ]
 
 
 def _sides(axes: Float[np.ndarray, "3 3"]) -> list[str]:
     """Write a button for each side that the clouds can be seen from."""
-    return [f'<button data-camera="{escape(_json(_camera(axes, side)))}">{side}</button>' for side in SIDES]
-
-
-def _json(value: Any) -> str:
-    import json
-
-    return json.dumps(value)
+    return [
+        f'<button data-camera="{escape(json.dumps(_camera(axes, side)))}">{side}</button>' for side in SIDES
+    ]
 
 
 def _legend(scene: Scene) -> str:
@@ -236,13 +249,16 @@ style-src 'unsafe-inline'; img-src data: blob:">
 * { box-sizing: border-box; }
 body { margin: 0; height: 100vh; display: flex; font: 14px/1.45 system-ui, sans-serif; color: var(--ink);
   background: var(--paper); }
-aside { width: 340px; flex: none; overflow: auto; padding: 16px; border-right: 1px solid var(--line); }
-main { flex: 1; min-width: 0; }
+aside { width: 380px; flex: none; overflow: auto; padding: 16px; border-right: 1px solid var(--line); }
+main { flex: 1; min-width: 0; position: relative; }
+.sides { position: absolute; top: 12px; right: 12px; z-index: 1; }
+.hint { margin-top: 18px; opacity: 0.7; }
 h1 { font-size: 17px; margin: 0 0 8px; overflow-wrap: anywhere; }
 h2 { font-size: 13px; margin: 18px 0 6px; font-weight: 600; }
 p { margin: 4px 0; }
-pre { font: 12px/1.5 ui-monospace, monospace; white-space: pre-wrap; overflow-wrap: anywhere; padding: 10px;
-  margin: 0; background: var(--pale); border-left: 4px solid $$good; }
+pre { font: 11.5px/1.5 ui-monospace, monospace; white-space: pre-wrap; padding: 10px; margin: 0;
+  background: var(--pale); border-left: 4px solid $$good; }
+pre span { display: block; padding-left: 4ch; text-indent: -4ch; }
 pre.bad { border-color: $$bad; }
 button { font: inherit; color: inherit; background: none; border: 1px solid var(--line); border-radius: 6px;
   padding: 4px 10px; cursor: pointer; }
@@ -267,18 +283,33 @@ i { flex: none; display: inline-block; width: 11px; height: 11px; border-radius:
 $buttons
 </div>
 $colors
-<h2>seen from</h2>
+<p class="hint">Drag to turn, scroll to come nearer, drag with the right button to move.</p>
+</aside>
+<main>
 <div class="sides">
 $sides
 </div>
-<p>Drag to turn, scroll to come nearer, drag with the right button to move.</p>
-</aside>
-<main>$drawing</main>
+$drawing
+</main>
 <script>
-for (const button of document.querySelectorAll("[data-traces]")) button.onclick = () => {
-  const on = button.getAttribute("aria-pressed") !== "true";
-  button.setAttribute("aria-pressed", on);
-  Plotly.restyle("view", { visible: on }, JSON.parse(button.dataset.traces));
+const buttons = [...document.querySelectorAll("[data-traces]")];
+// Equal axes around all that is shown, one diagonal wide, so that the eye keeps its place.
+function around() {
+  const boxes = buttons.filter(x => x.ariaPressed === "true").map(x => JSON.parse(x.dataset.box));
+  const layout = {}, spans = [];
+  for (const [k, name] of ["x", "y", "z"].entries()) {
+    const low = Math.min(...boxes.map(x => x[0][k])), high = Math.max(...boxes.map(x => x[1][k]));
+    layout[`scene.$${name}axis.range`] = [low, high];
+    spans.push(high - low);
+  }
+  const [x, y, z] = spans.map(span => span / Math.hypot(...spans));
+  return { ...layout, "scene.aspectratio": { x, y, z } };
+}
+for (const button of buttons) button.onclick = () => {
+  const on = button.ariaPressed !== "true";
+  button.ariaPressed = String(on);
+  const layout = buttons.some(x => x.ariaPressed === "true") ? around() : {};
+  Plotly.update("view", { visible: on }, layout, JSON.parse(button.dataset.traces));
 };
 for (const button of document.querySelectorAll("[data-camera]")) button.onclick = () =>
   Plotly.relayout("view", { "scene.camera": JSON.parse(button.dataset.camera) });
