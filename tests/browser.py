@@ -1,4 +1,4 @@
-"""A browser without a window, driven through the pipe of its developer tools; nothing but Python is needed."""
+"""A browser without a window, driven through the pipe of its developer tools by nothing but Python."""
 
 from __future__ import annotations
 

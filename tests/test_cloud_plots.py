@@ -18,7 +18,6 @@ from oracles import random_pose
 import teaser_jax as tj
 from teaser_jax import plots
 from teaser_jax.cli.places import draw_clouds, write_page
-from teaser_jax.plots import scene as scenes
 from teaser_jax.plots.scene import principal_axes, scene_of, thinned
 
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
@@ -27,7 +26,7 @@ pytest.importorskip("plotly", reason="needs the extra viz")
 SRC, DST = terrain(0, 8000, 0, 20), terrain(1, 8000, 4, 24)
 TRUE = random_pose(np.random.default_rng(3)).inverse()  # of the source as it is moved here
 MOVED = TRUE.inverse().apply(SRC)
-HOSTILE = "</script><script>document.body.innerHTML = ''</script> & <b>\"'"
+HOSTILE = "</title></script><script>document.body.innerHTML = ''</script> & <b>\"'"
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +40,12 @@ def answers() -> dict[str, tj.CloudRegistration]:
         "not ok": tj.register_clouds(MOVED, DST, initial=far, initial_error=0.5),
         "ambiguous": tj.register_clouds(*room, initial=np.eye(4)),
         "no pose": replace(
-            right, pose=tj.Pose.identity() if hasattr(tj.Pose, "identity") else tj.Pose(np.eye(3), np.zeros(3), 1.0),
-            status=tj.Status.NO_CONSENSUS, doubt="matches", evidence=None, candidates=(), equivalent=(),
+            right, pose=tj.Pose(np.eye(3), np.zeros(3), np.float64(1)), status=tj.Status.NO_CONSENSUS,
+            doubt="matches", evidence=None, candidates=(), equivalent=(),
         ),
     }  # fmt: skip
-    assert [x.status.name for x in found.values()] == ["OK", "NO_CONSENSUS", "AMBIGUOUS", "NO_CONSENSUS"]
+    assert [x.ok for x in found.values()] == [True, False, False, False]
+    assert found["ambiguous"].status == tj.Status.AMBIGUOUS
     assert len(found["ambiguous"].equivalent) >= 3
     return found
 
@@ -57,28 +57,24 @@ def pixels(figure) -> np.ndarray:
     return mpl.image.imread(buffer, format="png")[..., :3]
 
 
-PANELS = {
-    "ok": ["Before", "After, from above", "After, from the side"],
-    "not ok": ["Before", "After, from above", "After, from the side"],
-    "ambiguous": ["Before", "After, from above", "After, from the side", "Other pose 1", "Other pose 2", "Other pose 3"],
-    "no pose": ["Before"],
-}  # fmt: skip
+KINDS = ("ok", "not ok", "ambiguous", "no pose")
 
 
-@pytest.mark.parametrize("kind", PANELS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_answer_has_its_picture(answers, kind: str):
     result = answers[kind]
     figure = tj.plot(result)
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
-    rivals = [f"Other pose {k}" for k in range(1, 1 + min(3, len(result.equivalent)))]
-    expected = [x for x in PANELS[kind] if not x.startswith("Other")] + rivals
-    assert [any(title.startswith(x) for x in expected) for title in titles] == [True] * len(expected)
+    expected = ["Before"]
+    if kind != "no pose":
+        rivals = range(1, 1 + min(3, len(result.equivalent)))
+        expected += ["After, from above", "After, from the side", *(f"Other pose {k} of" for k in rivals)]
+    assert len(titles) == len(expected)
+    assert all(title.startswith(x) for title, x in zip(titles, expected, strict=True))
     assert (pixels(figure).min(axis=-1) < 0.9).mean() > 0.005
-    words = figure.get_suptitle()
+    words = " ".join(figure.get_suptitle().split())
     assert words.startswith("ok: points of the overlap are off by" if result.ok else "NOT OK, ")
-    if not result.ok:
-        assert result.advice.split(":")[0] in words.replace("\n", " ")
-    assert figure._suptitle.get_color() == (plots.INK if result.ok else plots.BAD)
+    assert result.ok or result.advice in words
 
 
 def test_the_same_answer_has_the_same_picture(answers):
@@ -92,11 +88,12 @@ def test_one_name_draws_both_kinds_of_answers(small, solved):
 
 
 def test_other_points_of_the_same_frames_can_be_drawn(answers):
-    few = scene_of(answers["ok"], 500, MOVED[::4], DST[::4])
-    assert len(few.target) <= 500
-    whole = scene_of(answers["ok"], 10**6)
-    np.testing.assert_allclose(few.after.points[0], whole.after.points[0] + 0, atol=2 * few.voxel_size * 20)
-    assert tj.plot(answers["ok"], MOVED[::4], DST[::4]).axes
+    result = answers["ok"]
+    few = scene_of(result, 10**6, MOVED[::4], DST[::4])
+    middle = np.median(DST[::4], axis=0)
+    np.testing.assert_allclose(few.target, DST[::4] - middle, atol=1e-9)
+    np.testing.assert_allclose(few.after.points, result.pose.apply(MOVED[::4]) - middle, atol=1e-9)
+    assert len(tj.plot(result, MOVED[::4], DST[::4]).axes) >= 3
 
 
 def test_distances_are_those_to_the_nearest_point_of_the_target(answers):
@@ -160,7 +157,7 @@ class Reader(HTMLParser):
             self.buttons[-1] += data
 
 
-@pytest.mark.parametrize("kind", PANELS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_answer_has_its_page(answers, kind: str):
     result = answers[kind]
     text = plots.view(result, title=HOSTILE)
@@ -205,11 +202,10 @@ def test_files_are_written_whole_or_not_at_all(answers, tmp_path: Path, monkeypa
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_browser_turns_the_page(answers, tmp_path: Path, monkeypatch):
+def test_a_browser_turns_the_page(answers, tmp_path: Path):
     browser = find_browser()
     if browser is None:
         pytest.skip("needs Chromium: on the path, of playwright, or named by CHROMIUM")
-    monkeypatch.setattr(plots.view.__globals__["scene_of"].__globals__["scenes"] if False else scenes, "MOST_RIVALS", 1)
     plots.write_view(tmp_path / "view.html", answers["ambiguous"], title=HOSTILE)
     with page(browser, tmp_path / "profile") as tab:
         tab.open(tmp_path / "view.html")

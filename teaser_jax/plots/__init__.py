@@ -26,6 +26,6 @@ from teaser_jax.plots.view import view, write_view
 __all__ = [
     "BAD", "DST", "GOOD", "INK", "PALE", "SRC",
     "plot", "plot_bounds", "plot_certified", "plot_clique", "plot_clouds", "plot_errors", "plot_graph",
-    "plot_landscape", "plot_refinement", "plot_registration", "plot_residuals", "plot_slopes", "plot_training",
-    "plot_translation", "plot_trims", "view", "write_view",
+    "plot_landscape", "plot_refinement", "plot_registration", "plot_residuals", "plot_slopes",
+    "plot_training", "plot_translation", "plot_trims", "view", "write_view",
 ]  # fmt: skip

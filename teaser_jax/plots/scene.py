@@ -96,7 +96,7 @@ def scene_of(result: CloudRegistration, most: int, src: Any = None, dst: Any = N
     overlap = target.points if after is None else after.points[after.paired]
     axes = principal_axes(overlap if len(overlap) >= FEWEST else target.points)
     scale = float(result.pose.scale)
-    reach = reach_of(target.points @ axes[0]) + reach_of(scale * some @ axes[0])
+    reach = sum(reach_of(x @ axes.T)[0] for x in (target.points, scale * some))
     beside = -APART * reach * axes[0]
     return Scene(
         target=thinned(target.points, most),
