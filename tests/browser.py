@@ -9,6 +9,7 @@ import os
 import select
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -127,10 +128,13 @@ def page(browser: str, folder: Path) -> Iterator[Page]:
     """A tab of a browser of one's own, which ends with the block."""
     theirs, to = os.pipe()
     back, ours = os.pipe()
-    # The browser reads from 3 and writes to 4: a shell puts the pipes there, at any numbers.
-    shell = ["sh", "-c", f'exec "$0" "$@" 3<&{theirs} 4>&{ours}', browser]
+    # The browser reads from 3 and writes to 4: a process that becomes it puts the pipes there.
+    become = (
+        f"import os, sys; a, b = os.dup({theirs}), os.dup({ours}); "
+        "os.dup2(a, 3), os.dup2(b, 4); [os.set_inheritable(x, True) for x in (3, 4)]; os.execv(sys.argv[1], sys.argv[1:])"
+    )
     process = subprocess.Popen(
-        [*shell, *FLAGS, f"--user-data-dir={folder}"],
+        [sys.executable, "-ISc", become, browser, *FLAGS, f"--user-data-dir={folder}"],
         pass_fds=(theirs, ours), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     os.close(theirs), os.close(ours)
