@@ -131,7 +131,8 @@ def page(browser: str, folder: Path) -> Iterator[Page]:
     # The browser reads from 3 and writes to 4: a process that becomes it puts the pipes there.
     become = (
         f"import os, sys; a, b = os.dup({theirs}), os.dup({ours}); "
-        "os.dup2(a, 3), os.dup2(b, 4); [os.set_inheritable(x, True) for x in (3, 4)]; os.execv(sys.argv[1], sys.argv[1:])"
+        "os.dup2(a, 3), os.dup2(b, 4); os.set_inheritable(3, True), os.set_inheritable(4, True); "
+        "os.execv(sys.argv[1], sys.argv[1:])"
     )
     process = subprocess.Popen(
         [sys.executable, "-ISc", become, browser, *FLAGS, f"--user-data-dir={folder}"],

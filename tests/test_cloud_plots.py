@@ -175,7 +175,7 @@ def test_every_kind_of_answer_has_its_page(answers, kind: str):
     shown = re.findall(r'data-traces="\[([\d, ]+)\]"', text)
     assert len(shown) == len(layers)
     numbers = [int(number) for traces in shown for number in traces.split(",")]
-    assert numbers == list(range(text[text.rindex("Plotly.newPlot(") :].count('"type":"scatter3d"')))
+    assert numbers == list(range(text[text.rindex("Plotly.newPlot(") :].count('"hoverinfo":"skip"')))
     assert all(any(button.strip().startswith(x) for button in read.buttons) for x in layers)
     assert len(text) < 12e6
 

@@ -148,7 +148,7 @@ def _figure(layers: list[Layer], scene: Scene) -> Any:
     }
     figure.update_layout(
         margin=dict.fromkeys("lrtb", 0), paper_bgcolor="rgba(0,0,0,0)", showlegend=False, hovermode=False,
-        template={}, uirevision="kept", scene={
+        uirevision="kept", scene={
             "aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio, strict=True)), "dragmode": "orbit",
             "bgcolor": "rgba(0,0,0,0)", "camera": _camera(scene.axes, "oblique"), **axes,
         },
