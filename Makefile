@@ -7,7 +7,7 @@ READY := $(VENV)/ready
 PEERS := $(VENV)-peers/ready
 INSTALL := -m pip install --quiet --disable-pip-version-check
 # The lower bounds of pyproject.toml. Their wheels are for Python 3.11 and 3.12.
-OLDEST := jax==0.8.0 jaxlib==0.8.0 jaxtyping==0.2.34 networkx==3.0 numba==0.60.0 numpy==2.0.0 matplotlib==3.9.0 scs==3.2.7 optax==0.2.4 plotly==5.24.0 tqdm==4.66.0 trimesh==4.4.0 laspy==2.6.1 lazrs==0.6.3 python-neo-lzf==0.3.5
+OLDEST := jax==0.8.0 jaxlib==0.8.0 jaxtyping==0.2.34 networkx==3.0 numba==0.60.0 numpy==2.0.0 matplotlib==3.9.0 scs==3.2.7 optax==0.2.4 plotly==6.0.0 tqdm==4.66.0 trimesh==4.4.0 laspy==2.6.1 lazrs==0.6.3 python-neo-lzf==0.3.5
 TEST := -m pytest -n 2 --dist loadfile --no-loadscope-reorder -q
 
 # Tests, benchmarks and notebooks on real data skip where there is none.

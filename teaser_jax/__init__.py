@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # for editors and type checkers: at run time the table below 
     from teaser_jax.clouds.prepared import prepare
     from teaser_jax.clouds.register import register_clouds
     from teaser_jax.clouds.registration import CloudRegistration
+    from teaser_jax.plots.either import plot
     from teaser_jax.pose import Pose
     from teaser_jax.problem import Problem, host_problem, make_problem, stack_problems
     from teaser_jax.profile import profile
@@ -47,14 +48,14 @@ _HOMES = {
     "Pose": "pose", "Settings": "settings", "Status": "solution", "Selection": "solution",
     "Solution": "solution", "certify": "certify.pose", "certify_rotation": "certify.rotation",
     "verify": "certify.verify", "Certificate": "certify.certificate",
-    "error_bounds": "certify.error_bounds", "covariance": "uncertainty",
+    "error_bounds": "certify.error_bounds", "covariance": "uncertainty", "plot": "plots.either",
 }  # fmt: skip
 _MODULES = ("files", "learn", "metrics", "plots", "settings", "so3", "studies", "synthetic")
 
 __all__ = [
     "Certificate", "CloudRegistration", "Pose", "Problem", "Registration", "Selection", "Settings",
     "Solution", "Status", "certify", "certify_rotation", "covariance", "error_bounds", "files",
-    "host_problem", "learn", "make_problem", "metrics", "plots", "prepare", "profile", "refit",
+    "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare", "profile", "refit",
     "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve", "solve_batch",
     "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
 ]  # fmt: skip

@@ -14,7 +14,15 @@ import numpy as np
 
 import teaser_jax as tj
 from teaser_jax.cli.endings import OK, UNTRUSTED, BadInput
-from teaser_jax.cli.places import check_matplotlib, check_plotly, check_writable, failures_named, writing
+from teaser_jax.cli.places import (
+    check_matplotlib,
+    check_plotly,
+    check_writable,
+    draw_clouds,
+    failures_named,
+    write_page,
+    writing,
+)
 from teaser_jax.cli.report import clouds_as_plain_data
 from teaser_jax.files.cloud_file import CloudFile
 from teaser_jax.files.clouds import read_cloud, write_cloud
@@ -46,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     src, dst = _read(arguments.source), _read(arguments.target)
     result = _answer(arguments, src, dst)
     older = places["output"] is not None and places["output"].exists()
-    _write(result, src, dst, places)
+    _write(result, src, dst, places, f"{arguments.source.name} in the frame of {arguments.target.name}")
     if places["output"] is not None and not result.ok:
         what = "not written, and the older file removed" if older else "not written"
         print(f"teaser-jax: {one_line(places['output'])} {what}: {result.status.name}", file=sys.stderr)
@@ -111,7 +119,7 @@ def _answer(arguments: argparse.Namespace, src: CloudFile, dst: CloudFile) -> tj
 
 
 def _write(
-    result: tj.CloudRegistration, src: CloudFile, dst: CloudFile, places: dict[str, Path | None]
+    result: tj.CloudRegistration, src: CloudFile, dst: CloudFile, places: dict[str, Path | None], title: str
 ) -> None:
     """Write pictures, merged cloud and pose, or none of them if one fails.
 
@@ -119,9 +127,9 @@ def _write(
     """
     with ExitStack() as until_all_is_well:
         if places["plot"] is not None:
-            tj.plot(result).savefig(until_all_is_well.enter_context(writing(places["plot"])))
+            draw_clouds(until_all_is_well.enter_context(writing(places["plot"])), result)
         if places["html"] is not None:
-            tj.plots.write_view(until_all_is_well.enter_context(writing(places["html"])), result)
+            write_page(until_all_is_well.enter_context(writing(places["html"])), result, title)
         if result.ok and places["merged"] is not None:
             _write_merged(until_all_is_well.enter_context(writing(places["merged"])), result, src, dst)
         if result.ok and places["output"] is not None:

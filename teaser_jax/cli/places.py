@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from teaser_jax.cli.endings import BadInput
+from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.ground.extras import needed
 from teaser_jax.ground.io import replacing
 from teaser_jax.register import Registration
@@ -57,11 +58,33 @@ def check_matplotlib() -> None:
         raise BadInput(str(error)) from None
 
 
+def check_plotly() -> None:
+    """Raise BadInput if no page can be written."""
+    try:
+        needed("plotly.graph_objects", "pages need plotly", "viz")
+    except ImportError as error:
+        raise BadInput(str(error)) from None
+
+
 def draw(path: Path, src: np.ndarray, dst: np.ndarray, result: Registration) -> None:
     """Write the picture of an answer."""
     from teaser_jax.plots import plot_registration
 
     plot_registration(src, dst, result).savefig(path)
+
+
+def draw_clouds(path: Path, result: CloudRegistration) -> None:
+    """Write the picture of an answer to two clouds."""
+    from teaser_jax.plots import plot
+
+    plot(result).savefig(path)
+
+
+def write_page(path: Path, result: CloudRegistration, title: str) -> None:
+    """Write the page of an answer to two clouds."""
+    from teaser_jax.plots import write_view
+
+    write_view(path, result, title=title)
 
 
 @contextmanager

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from os import PathLike
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from teaser_jax.files.clouds import read_cloud
 from teaser_jax.ground.checks import check_positive
 from teaser_jax.reading import coordinates_of, real_numbers
 
@@ -85,7 +87,7 @@ def as_cloud(
 
     Args:
         value: (n, 3) numbers or more columns, of which the first three count: an array of numpy, JAX or
-            torch, a structured one with fields x, y, z, a cloud of Open3D. A ``Cloud`` is returned as it is.
+            torch, a structured one with fields x, y, z, a cloud of Open3D, or the path of a file. A ``Cloud`` is returned as it is.
         name: What to call it in errors.
         viewpoint: Where the sensor stood, (3,), in the frame of the cloud [length].
         crop: The lower and the upper corner of a box; points outside are left out [length].
@@ -93,12 +95,14 @@ def as_cloud(
             out [length].
 
     Raises:
-        ValueError: If it cannot be read, or fewer than 100 points are left.
+        ValueError: If it cannot be read, or fewer than 100 points are left; of files a ``FileError``.
     """
     if isinstance(value, Cloud):
         if not (viewpoint is None and crop is None and max_range is None):
             raise ValueError(f"{name} was read already: give viewpoint, crop and max_range when it is read.")
         return value
+    if isinstance(value, (str, PathLike)):
+        value = read_cloud(value).points
     rows = real_numbers(coordinates_of(value), name)
     if rows.ndim != 2 or rows.shape[1] < 3:
         raise ValueError(f"{name} has shape {rows.shape}: expected (n, 3), one point a row.")

@@ -69,7 +69,8 @@ def register_clouds(
 
     Args:
         src, dst: The clouds, of any two sizes: (n, 3) arrays of numpy, JAX or torch, structured arrays with
-            x, y, z, clouds of Open3D, or what ``prepare`` made of one. Further columns are ignored.
+            x, y, z, clouds of Open3D, paths of files, or what ``prepare`` made of one. Further columns
+            and colours are ignored.
         voxel_size: Width of the cells that the verdict rests on; None: 6000 of them in the cloud that needs
             the finer ones, not finer than its points lie [length].
         tolerance: ``ok`` shall promise that points of the overlap are off by less than this, too [length].

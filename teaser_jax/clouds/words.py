@@ -87,8 +87,8 @@ def _of_tolerance(result: CloudRegistration, e: Evidence) -> str:
 def _of_part(result: CloudRegistration, e: Evidence) -> str:
     return (
         "One cloud is a body and the other a scan of one side, and no pose was found in which the scan lies "
-        "on the body and shows what a camera would see of it: they may not be of one object, or the scan holds "
-        "other things, too (crop leaves them out)."
+        "on the body and shows what a camera would see of it: they may not be of one object, or the scan "
+        "holds other things, too (crop leaves them out)."
     )
 
 

@@ -73,8 +73,8 @@ def _reader(path: Path) -> Callable[[Path], MatchFile]:
     suffix, kinds = path.suffix.lower(), ", ".join(readers)
     if suffix in CLOUDS:
         raise FileError(
-            f"{path}: is a cloud, and matches are needed: match the two clouds first, and save row i "
-            f"of one with row i of the other as one of {kinds}."
+            f"{path}: is a cloud: name a second one after it, as register_clouds takes two. Matches are one "
+            f"of {kinds}."
         )
     if suffix == ".mat":
         raise FileError(
