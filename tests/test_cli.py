@@ -164,7 +164,7 @@ def test_bad_input_leaves_an_older_file_alone(matches, tmp_path, capsys, name, b
     [
         ([], "required: COMMAND"),
         (["regsiter"], "invalid choice: 'regsiter'"),
-        (["register"], "required: MATCHES"),
+        (["register"], "required: FILE"),
         (["register", "{m}"], "--noise-bound is missing"),
         (["register", "{m}", "--noise-bound", "much"], "invalid float value: 'much'"),
         (["register", "{m}", "--noise-bound", "nan"], "noise_bound contains nan"),
@@ -179,7 +179,7 @@ def test_bad_input_leaves_an_older_file_alone(matches, tmp_path, capsys, name, b
         (["register", "{m}", "--noise-bound", "1", "--clique", "big"], "invalid choice: 'big'"),
         (["register", "{m}", "--noise-bound", "1", "-o", "{d}"], "is a folder: name a file to write"),
         (["register", "{m}", "--noise-bound", "1", "-o", "{d}/no/T.txt"], "does not exist: make it first"),
-        (["register", "{m}", "--noise-bound", "1", "-o", "{m}"], "is the file of matches"),
+        (["register", "{m}", "--noise-bound", "1", "-o", "{m}"], "is a file that is read"),
         (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.bmp2"], "end the name in one of .png"),
         (["register", "{m}", "--noise-bound", "1", "--plot", "{d}/p.pgf"], "end the name in one of .png"),
         (["register", "{m}", "--noise-bound", "1", "--plot", "-"], "name a file"),

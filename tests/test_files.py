@@ -119,7 +119,7 @@ def test_the_default_header_of_pandas_is_no_match(tmp_path, header):
         ("m.csv", b"x,y,z,u,v,w\n# why\n\n1,2,3,4,5,6\n1,2,3\n", "line 5 has 3 columns: expected six"),
         ("m.csv", b"1,2,3,4,5,6\n1,2,3,4,5,six\n", "line 2 holds 'six' in column 6: expected six numbers"),
         ("m.csv", b"a,2,3,4,5,6\n1,2,3,4,5,6\n", "line 1 holds 'a'"),
-        ("m.ply", b"ply\n", "is a cloud, and matches are needed"),
+        ("m.ply", b"ply\n", "is a cloud: name a second one after it"),
         ("m.odd", b"1\n", "unknown extension '.odd'"),
         ("matches", b"1 2 3 4 5 6\n", "unknown extension ''"),
     ],

@@ -14,7 +14,7 @@ CLIQUES = ("exact", "greedy", "networkx", "none")
 ROTATIONS = ("gnc", "global", "sdp")
 TIM_GRAPHS = ("chain", "complete")
 VOTES = ("tls", "consensus")
-REFINEMENTS = ("gicp", "plane", "none")
+ALIGNMENTS = ("gicp", "plane", "none")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -106,7 +106,7 @@ def _add_clouds(register: argparse._ArgumentGroup) -> None:
         help="how many threads to work with; they change no answer (default: one for each core)",
     )  # fmt: skip
     register.add_argument(
-        "--refine", choices=REFINEMENTS, default=absent,
+        "--align", choices=ALIGNMENTS, default=absent,
         help="how to align at last: by the shape of both clouds, by planes of the second (default: gicp)",
     )  # fmt: skip
     register.add_argument(

@@ -33,10 +33,10 @@ OPTIONS = (
     "voxel_size", "tolerance", "src_viewpoint", "dst_viewpoint", "initial_error", "max_range", "threads",
     "seconds",
 )  # fmt: skip
-CLOUDS_ONLY = (*OPTIONS, "initial", "crop", "refine", "html", "merged")
+CLOUDS_ONLY = (*OPTIONS, "initial", "crop", "align", "html", "merged")
 MATCHES_ONLY = (
     "noise_bound", "cbar2", "certify", "clique", "rotation", "clique_seconds", "clique_nodes", "tim_graph",
-    "vote",
+    "vote", "refine",
 )  # fmt: skip
 
 
@@ -66,7 +66,8 @@ def check_kind(arguments: argparse.Namespace, others: Collection[str], what: str
     """Raise BadInput if an option is given that belongs to another kind of input."""
     for name in others:
         if name in vars(arguments):
-            raise BadInput(f"--{name.replace('_', '-')} belongs to {what}, see teaser-jax register --help")
+            option = "no-refine" if name == "refine" else name.replace("_", "-")
+            raise BadInput(f"--{option} belongs to {what}, see teaser-jax register --help")
 
 
 def _check_places(sources: tuple[Path, Path], places: dict[str, Path | None]) -> None:
@@ -105,8 +106,8 @@ def _answer(arguments: argparse.Namespace, src: CloudFile, dst: CloudFile) -> tj
         known["scale"] = given["scale"]
     if "crop" in given:
         known["crop"] = np.reshape(given["crop"], (2, 3))
-    if "refine" in given:
-        known["refine"] = None if given["refine"] == "none" else given["refine"]
+    if "align" in given:
+        known["refine"] = None if given["align"] == "none" else given["align"]
     if "initial" in given:
         known["initial"] = read_poses(given["initial"]).poses[0]
     try:

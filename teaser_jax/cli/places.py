@@ -47,7 +47,7 @@ def check_writable(path: Path, source: Path | None = None) -> None:
     if not all(os.access(place, os.W_OK) for place in (folder, path) if place.exists()):
         raise BadInput(f"{path}: cannot be written: no permission")
     if source is not None and path.exists() and source.exists() and path.samefile(source):
-        raise BadInput(f"{path}: is the file of matches: name another one to write")
+        raise BadInput(f"{path}: is a file that is read: name another one to write")
 
 
 def check_matplotlib() -> None:

@@ -87,7 +87,8 @@ def as_cloud(
 
     Args:
         value: (n, 3) numbers or more columns, of which the first three count: an array of numpy, JAX or
-            torch, a structured one with fields x, y, z, a cloud of Open3D, or the path of a file. A ``Cloud`` is returned as it is.
+            torch, a structured one with fields x, y, z, a cloud of Open3D, or the path of a file. A ``Cloud``
+            is returned as it is.
         name: What to call it in errors.
         viewpoint: Where the sensor stood, (3,), in the frame of the cloud [length].
         crop: The lower and the upper corner of a box; points outside are left out [length].

@@ -120,7 +120,7 @@ def _read_npy(path: Path) -> MatchFile:
     if shape[1:] != (6,):
         raise FileError(
             f"{path}: holds an array of shape {shape}: expected matches, (n, 6): x y z of the source point, "
-            "then of the target. Of two clouds, match them first."
+            "then of the target. Two clouds are given by two files."
         )
     return MatchFile(table[:, :3], table[:, 3:], {})
 
