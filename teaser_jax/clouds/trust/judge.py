@@ -128,13 +128,14 @@ def judge(
     a, b = pair.surfaces_near(pose, CELLS, MOST_CELLS)
     with pair.timed("alignment"):
         pose = pose if refine is None else align(pose, a, b)
+    finer = _at_finer_cells(pose, pair, a, b, refine)
+    pose = finer.pose
     with pair.timed("verdict"):
         here, back = both_ways(pose, a, b)
         seen = observability(here)
         rivals = find_rivals(pose, a, b, here, seen, others)
     chosen = here.fits & (here.weight > 0)
     residual = 1.4826 * float(np.median(np.abs(here.residual[chosen]))) if chosen.any() else np.inf
-    finer = _at_finer_cells(pose, pair, a, b, refine)
     evidence = Evidence(
         voxel_size=b.voxel_size,
         fine_voxel_size=finer.voxel_size,
@@ -153,7 +154,7 @@ def judge(
             fewer = find_rivals(pose, a, b, here, seen, others, guess)
         evidence = replace(evidence, rivals=fewer)
         verdict = verdict_of(evidence, tolerance)
-    return Judged(finer.pose, evidence, verdict)
+    return Judged(pose, evidence, verdict)
 
 
 def verdict_of(evidence: Evidence, tolerance: float | None = None) -> Verdict:
