@@ -26,6 +26,7 @@ ORDER = [
     "stages.rotation.pair_search",
     "stages.rotation.relaxation", "stages.rotation.robust",
     "stages.translation", "stages.refinement", "stages.position", "stages.chance", "stages.verdict",
+    "stages.rivals.seeds", "stages.rivals.evidence", "stages.rivals.search",
     "settings", "refit", "agreement", "cascade", "solve", "soft", "uncertainty",
     "engine.compiler", "engine.sizes", "engine.packing", "engine.frames", "engine.compaction",
     "engine.programs", "engine.single", "diagnosis",
