@@ -168,7 +168,8 @@ def test_triangles_by_counting():
     src, dst, _, _ = planted()
     n = len(src)
     mask = np.arange(n) % 7 != 0
-    edges = np.array(tight_graph(src, dst, np.full(n, BOUND, np.float32), mask))
+    inputs = src, dst, np.full(n, BOUND, np.float32), mask
+    edges = np.array(tight_graph(*map(jnp.asarray, inputs)))
     counts = np.array(triangles(jnp.asarray(edges)))
     for i in range(0, n, 9):
         for j in range(n):

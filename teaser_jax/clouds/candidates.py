@@ -1,7 +1,9 @@
 """Poses that may be right, from several sets of matches, in stages that end when one of them fits.
 
 One width of cells and one way to match finds most poses, and each of them misses others. What fits best on
-the clouds themselves is nearly always the best of them, whatever its matches say.
+the clouds themselves is nearly always the best of them, whatever its matches say. Where structure repeats or
+little overlaps, more matches agree on a wrong pose than on the right one: the last stages take several poses
+from one set of matches, and let the clouds choose.
 """
 
 from __future__ import annotations
@@ -10,6 +12,8 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -18,10 +22,11 @@ from teaser_jax.clouds.features.matching import Nearest, chosen, nearest_of
 from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.judge import CELLS, FEWEST_CELLS
-from teaser_jax.clouds.trust.pairing import both_ways
+from teaser_jax.clouds.trust.pairing import both_ways, shares
 from teaser_jax.clouds.voxel import downsample, voxel_size_for_both
 from teaser_jax.register import Registration, register
 from teaser_jax.settings import ExactClique, Settings
+from teaser_jax.stages.rivals.search import RivalSearch, find_rivals
 
 MOST_CELLS = 200_000  # of the larger one
 MOST_MATCHES = 5000
@@ -32,14 +37,23 @@ SECONDS = 2.0  # a clique may be searched
 
 @dataclass(frozen=True)
 class Stage:
-    """A way to find matches: cells of the smaller cloud, whether mutual, and the bound in cells."""
+    """A way to find matches, and what to make of them.
+
+    Attributes:
+        cells: Of the smaller cloud, about.
+        mutual: Whether each is the other's nearest.
+        bound: How far right matches lie apart at most, in cells.
+        several: Whether to take several answers to the matches, and of these the one that fits.
+    """
 
     cells: int
     mutual: bool
     bound: float
+    several: bool = False
 
     def __str__(self) -> str:
-        return f"{self.cells} cells, {'mutual' if self.mutual else 'nearest'}"
+        several = ", several answers" if self.several else ""
+        return f"{self.cells} cells, {'mutual' if self.mutual else 'nearest'}{several}"
 
 
 STAGES = (
@@ -47,7 +61,15 @@ STAGES = (
     Stage(6000, False, 1.0),
     Stage(3000, False, 1.5),
     Stage(12_000, True, 1.5),
+    Stage(6000, False, 1.0, several=True),
+    Stage(12_000, True, 1.0, several=True),
 )
+# Of several answers: how many, the matches that they start from, the cells to move them to where the surfaces
+# lie and how far these may be apart, the cells that are asked how well they fit there, and how many of the
+# answers are compared at the width of the verdict.
+SEVERAL = RivalSearch(answers=12, rows=2048)
+COARSE_CELLS, COARSE_REACH = 3000, 4.0
+ASKED, COMPARED = 400, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +81,14 @@ class Candidate:
         fit: Which part of the overlap fits at the width of the verdict [-].
         cells: How many cells fit.
         stage: How its matches were found.
-        registration: The answer of ``register`` to them.
+        registration: The answer of ``register`` to them; None: it is one of several answers.
     """
 
     pose: Float[np.ndarray, "4 4"]
     fit: float
     cells: int
     stage: Stage
-    registration: Registration
+    registration: Registration | None
 
     @property
     def score(self) -> float:
@@ -116,6 +138,8 @@ class Pair:
         src, dst = self.matches(stage)
         if len(src) < FEWEST_MATCHES:
             return None
+        if stage.several:
+            return self._best_of_several(stage, src, dst)
         start = time.perf_counter()
         size = self.surfaces(stage.cells)[1].voxel_size
         settings = Settings(clique=ExactClique(seconds=SECONDS))
@@ -126,6 +150,25 @@ class Pair:
         self._spent("comparison", start)
         return Candidate(*found, stage, registration)
 
+    def _best_of_several(
+        self, stage: Stage, src: Float[np.ndarray, "m 3"], dst: Float[np.ndarray, "m 3"]
+    ) -> Candidate | None:
+        """Find the answer to one set of matches that fits best; None: there is no answer."""
+        start = time.perf_counter()
+        poses = several_poses(src, dst, self.surfaces(stage.cells)[1].voxel_size, stage.bound)
+        self._spent("several answers", start)
+        if len(poses) == 0:
+            return None
+        start = time.perf_counter()
+        coarse = self.surfaces(COARSE_CELLS)
+        poses = np.stack([align(pose, *coarse, reach=COARSE_REACH) for pose in poses])
+        rows = np.linspace(0, len(coarse[0]) - 1, ASKED).astype(np.int64)
+        quick = shares(poses, *coarse, rows)
+        chosen = poses[np.argsort(-quick, kind="stable")[:COMPARED]]
+        found = [Candidate(*self.compared(pose), stage, None) for pose in chosen]
+        self._spent("comparison", start)
+        return max(found, key=lambda candidate: candidate.score)
+
     def compared(self, pose: Float[np.ndarray, "4 4"]) -> tuple[Float[np.ndarray, "4 4"], float, int]:
         """Align a pose at the width of the verdict: the pose, its fit, and how many cells fit."""
         src, dst = self.surfaces(CELLS)
@@ -135,6 +178,28 @@ class Pair:
 
     def _spent(self, name: str, start: float) -> None:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def several_poses(
+    src: Float[np.ndarray, "m 3"], dst: Float[np.ndarray, "m 3"], voxel_size: float, bound: float
+) -> Float[np.ndarray, "k 4 4"]:
+    """Find poses that several sets of matches agree on, best first.
+
+    Args:
+        src, dst: Matches, the clearest first, about the middles of their clouds [length].
+        voxel_size: Width of a cell [length].
+        bound: How far right matches lie apart at most, in cells.
+    """
+    missing = MOST_MATCHES - len(src)  # one program for all
+    a, b = (
+        jnp.asarray(np.pad((x / voxel_size).astype(np.float32), ((0, missing), (0, 0)))) for x in (src, dst)
+    )
+    mask = jnp.asarray(np.arange(MOST_MATCHES) < len(src))
+    bounds = jnp.full(MOST_MATCHES, bound, jnp.float32)
+    found = jax.device_get(find_rivals(a, b, bounds, mask, scale=jnp.float32(1), search=SEVERAL))
+    poses = np.asarray(found.pose.matrix, np.float64)[found.valid]
+    poses[:, :3, 3] *= voxel_size
+    return poses
 
 
 def candidates(pair: Pair) -> Iterator[Candidate]:
