@@ -18,9 +18,10 @@ from teaser_jax.clouds.features.matching import Nearest, chosen, nearest_of
 from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.pair import Pair
 from teaser_jax.clouds.prepared import Prepared
+from teaser_jax.clouds.several import several_poses
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.judge import CELLS, FEWEST_CELLS
-from teaser_jax.clouds.trust.pairing import both_ways
+from teaser_jax.clouds.trust.pairing import both_ways, shares
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.pose import Pose
 from teaser_jax.register import Registration, register
@@ -34,14 +35,23 @@ SECONDS = 2.0  # a clique may be searched
 
 @dataclass(frozen=True)
 class Stage:
-    """A way to find matches: cells of the smaller cloud, whether mutual, and the bound in cells."""
+    """A way to find matches, and what to make of them.
+
+    Attributes:
+        cells: Of the smaller cloud, about.
+        mutual: Whether each is the other's nearest.
+        bound: How far right matches lie apart at most, in cells.
+        several: Whether to take several answers to the matches, and of these the one that fits.
+    """
 
     cells: int
     mutual: bool
     bound: float
+    several: bool = False
 
     def __str__(self) -> str:
-        return f"{self.cells} cells, {'mutual' if self.mutual else 'nearest'}"
+        several = ", several answers" if self.several else ""
+        return f"{self.cells} cells, {'mutual' if self.mutual else 'nearest'}{several}"
 
 
 STAGES = (
@@ -49,7 +59,13 @@ STAGES = (
     Stage(6000, False, 1.0),
     Stage(3000, False, 1.5),
     Stage(12_000, True, 1.5),
+    Stage(6000, False, 1.0, several=True),
+    Stage(12_000, True, 1.0, several=True),
 )
+# Of several answers: the cells to move them to where the surfaces lie and how far these may be apart, the
+# cells that are asked how well they fit there, and how many are compared at the width of the verdict.
+COARSE_CELLS, COARSE_REACH = 3000, 4.0
+ASKED, COMPARED = 400, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +114,7 @@ class Search:
         return np.inf if self.end is None else max(0.0, self.end - time.perf_counter())
 
     def matches(self, stage: Stage) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
-        """Match points of both clouds, in the frames as given, the clearest matches first."""
+        """Match points of both clouds, each about its middle, the clearest matches first."""
         pair = self.pair
         src, dst = pair.surfaces(stage.cells, MOST_CELLS)
         with pair.timed("descriptors"):
@@ -108,22 +124,42 @@ class Search:
                 self._nearest[stage.cells] = nearest_of(a, b)
             valid = np.asarray(a.valid), np.asarray(b.valid)
             found = chosen(self._nearest[stage.cells], *valid, mutual=stage.mutual, most=MOST_MATCHES)
-            return (
-                (src.points[found.rows[:, 0]] + pair.src.cloud.origin) / pair.scale,
-                dst.points[found.rows[:, 1]] + pair.dst.cloud.origin,
-            )
+            return src.points[found.rows[:, 0]], dst.points[found.rows[:, 1]]
 
     def candidate(self, stage: Stage) -> Candidate | None:
         """Find the candidate of one stage; None: there are no matches to speak of."""
         src, dst = self.matches(stage)
         if len(src) < FEWEST_MATCHES:
             return None
+        if stage.several:
+            return self._best_of_several(stage, src, dst)
         pair = self.pair
         bound = stage.bound * pair.width(stage.cells, MOST_CELLS)
         settings = Settings(clique=ExactClique(seconds=max(0.01, min(SECONDS, self.seconds_left))))
         with pair.timed("register"):
-            found = register(src, dst, noise_bound=bound, scale=pair.scale, settings=settings)
+            given = (src + pair.src.cloud.origin) / pair.scale, dst + pair.dst.cloud.origin
+            found = register(*given, noise_bound=bound, scale=pair.scale, settings=settings)
         return self.compared(found.pose, str(stage), found)
+
+    def _best_of_several(
+        self, stage: Stage, src: Float[np.ndarray, "m 3"], dst: Float[np.ndarray, "m 3"]
+    ) -> Candidate | None:
+        """Find the answer to one set of matches that fits best; None: there is no answer."""
+        pair = self.pair
+        with pair.timed("several answers"):
+            poses = several_poses(src, dst, pair.width(stage.cells, MOST_CELLS), stage.bound, MOST_MATCHES)
+        if len(poses) == 0:
+            return None
+        coarse = pair.surfaces(COARSE_CELLS, MOST_CELLS)
+        with pair.timed("alignment"):
+            aligned = [align(pose, *coarse, reach=COARSE_REACH) for pose in poses]
+            # Where little overlaps, cells without a partner draw right poses away: each may stay.
+            poses = np.concatenate([poses, aligned])
+            rows = np.linspace(0, len(coarse[0]) - 1, ASKED).astype(np.int64)
+            quick = shares(poses, *coarse, rows)
+        best = poses[np.argsort(-quick, kind="stable")[:COMPARED]]
+        found = [self.compared(pair.given(pose), str(stage), None) for pose in best]
+        return max(found, key=lambda candidate: candidate.score)
 
     def compared(self, pose: Pose, found_by: str, registration: Registration | None) -> Candidate:
         """Align a pose at the width of the verdict, and tell how well the clouds fit there."""
