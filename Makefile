@@ -35,7 +35,7 @@ $(READY): pyproject.toml
 	@$(BIN)/python $(INSTALL) --editable '.[dev]'
 	@touch $@
 
-demo: $(READY) ## Register 1000 matches of which 950 are wrong, and draw demo.png
+demo: $(READY) ## Register two partial scans, and draw demo.png
 	@$(BIN)/teaser-jax demo --plot demo.png
 
 test: $(READY) ## Run the tests, without the slow ones

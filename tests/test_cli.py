@@ -281,7 +281,7 @@ def test_a_bug_is_not_called_bad_input(matches, monkeypatch):
 def test_demo(tmp_path, small, capsys, monkeypatch):
     monkeypatch.setattr(tj.synthetic, "random_problem", lambda seed: small)
     path = tmp_path / "demo.png"
-    assert cli.main(["demo", "--plot", str(path)]) == 0
+    assert cli.main(["demo", "matches", "--plot", str(path)]) == 0
     out, err = capsys.readouterr()
     for part in (
         "32 matches, 16 of them wrong",
@@ -298,7 +298,7 @@ def test_demo(tmp_path, small, capsys, monkeypatch):
 def test_demo_without_matplotlib_leaves_the_picture_out(tmp_path, small, capsys, monkeypatch):
     monkeypatch.setattr(tj.synthetic, "random_problem", lambda seed: small)
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    assert cli.main(["demo", "--plot", str(tmp_path / "demo.png")]) == 0
+    assert cli.main(["demo", "matches", "--plot", str(tmp_path / "demo.png")]) == 0
     assert "teaser-jax[viz]" in capsys.readouterr().err
 
 

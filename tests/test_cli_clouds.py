@@ -51,6 +51,17 @@ def test_two_clouds_give_a_pose_a_picture_a_page_and_a_merged_cloud(files: Path,
     assert (merged.colours == 120).all()
 
 
+@pytest.mark.long
+def test_the_demo_registers_two_scans(tmp_path: Path, capsys):
+    path = tmp_path / "demo.png"
+    assert cli.main(["demo", "--plot", str(path)]) == 0
+    out, err = capsys.readouterr()
+    for part in ("scanned from two sides", "ok: OK", "Error against the truth", "descriptors", "Picture: "):
+        assert part in out
+    assert err == ""
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
 def test_json_holds_what_the_answer_rests_on_and_an_initial_pose_is_read(files: Path, capsys):
     arguments = ["register", files / "a.ply", files / "b.ply", "--initial", files / "near.txt", "--json"]
     assert cli.main([*map(str, arguments), "--initial-error", "1", "--align", "plane"]) == 0

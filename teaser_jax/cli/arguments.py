@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     commands = program.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_register(commands.add_parser("register", help="find the pose between two clouds, or behind matches"))
     _add_demo(
-        commands.add_parser("demo", help="register 1000 matches of which 950 are wrong, and draw the answer")
+        commands.add_parser("demo", help="register two scans, or a thousand matches, and draw the answer")
     )
     _add_study(
         commands.add_parser("study", help="run the paper's studies: tables and figures of many problems")
@@ -166,6 +166,10 @@ def _add_settings(register: argparse._ArgumentGroup) -> None:
 
 
 def _add_demo(demo: argparse.ArgumentParser) -> None:
+    demo.add_argument(
+        "what", nargs="?", choices=("clouds", "matches"), default="clouds",
+        help="two partial scans (default), or 1000 matches of which 950 are wrong",
+    )  # fmt: skip
     demo.add_argument(
         "--plot", type=_picture, default=Path("demo.png"), metavar="PNG", help="default: demo.png"
     )

@@ -163,7 +163,7 @@ def _searched(search: Search, ask: _Ask) -> tuple[list[Candidate], Judged | None
 
 
 def _with_part(search: Search, ask: _Ask, found: list[Candidate], judged: Judged | None) -> _Outcome:
-    """Where matches lead to nothing, look for a part in a scan of it, whose pose counts if it is found."""
+    """Look for a part in a scan of it where matches lead to nothing; its pose counts if it is found."""
     pair = search.pair
     if judged is not None and judged.verdict.doubt is None:
         return _Outcome(found, judged)
