@@ -200,7 +200,7 @@ def test_bad_input_leaves_an_older_file_alone(matches, tmp_path, capsys, name, b
         (["demo", "--plot", "demo.pgf"], "end the name in one of .png"),
         (["demo", "--seed", "-1"], "-1 is no seed"),
         (["register", "{m}", "--noise", "1"], "unrecognized arguments: --noise"),  # a shortened option
-        (["demo", "--pl", "x.png"], "unrecognized arguments: --pl"),
+        (["demo", "--pl=x.png"], "unrecognized arguments: --pl"),
     ],
 )
 def test_bad_arguments(matches, tmp_path, capsys, arguments, message):

@@ -64,7 +64,7 @@ def test_the_demo_registers_two_scans(tmp_path: Path, capsys):
 
 def test_json_holds_what_the_answer_rests_on_and_an_initial_pose_is_read(files: Path, capsys):
     arguments = ["register", files / "a.ply", files / "b.ply", "--initial", files / "near.txt", "--json"]
-    assert cli.main([*map(str, arguments), "--initial-error", "1", "--align", "plane"]) == 0
+    assert cli.main([*map(str, arguments), "--initial-error", "1", "--align", "gicp"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["ok"]
     assert report["candidates"][0]["found_by"] == "the initial pose"
