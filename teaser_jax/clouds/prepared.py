@@ -15,6 +15,7 @@ from teaser_jax.clouds.neighbours import Tree
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.voxel import LEAST_SPACINGS, POINTS_A_CELL, downsample, spacing, voxel_size_for
 from teaser_jax.ground.checks import whole_number
+from teaser_jax.ground.flags import as_on_the_host
 
 STEPS = 4  # widths of cells that a kept cloud is cut into, between one and twice as wide
 THINNED, ROUGHLY = 40_000, 20_000  # points that tell how far they lie apart; how wide cells are, about
@@ -145,7 +146,8 @@ def prepare(
         ValueError: If it cannot be read, or has fewer than 100 points that can be used.
         ImportError: Without the extra ``clouds``.
     """
-    read = as_cloud(cloud, name, viewpoint=viewpoint, crop=crop, max_range=max_range)
+    with as_on_the_host(x64=False):
+        read = as_cloud(cloud, name, viewpoint=viewpoint, crop=crop, max_range=max_range)
     return Prepared(read, threads_or_all(threads), is_kept=True)
 
 

@@ -25,6 +25,7 @@ from teaser_jax.clouds.trust.pairing import moved
 from teaser_jax.clouds.trust.rivals import Guess
 from teaser_jax.ground.arrays import AnyArray, inside_jit, is_traced
 from teaser_jax.ground.checks import check_positive, one_of
+from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose, as_pose
 from teaser_jax.reading import known_scale, real_numbers
 from teaser_jax.solution import Status
@@ -107,18 +108,18 @@ def register_clouds(
         raise ValueError("initial_error is given without initial: give the pose that may be so far off.")
     size, workers = float(known_scale(scale)), threads_or_all(threads)
     one = partial(_prepared, crop=crop, max_range=max_range, threads=workers)
-    clouds = one(src, "src", viewpoint=src_viewpoint), one(dst, "dst", viewpoint=dst_viewpoint)
-    pair = Pair(clouds[0].scaled(size), clouds[1], size, voxel_size)
-    described = None if descriptors is None else _descriptors(descriptors, clouds)
-    search = Search(pair, described, None if seconds is None else start + seconds)
-    pair.seconds["reading"] = time.perf_counter() - start
-    with _shown(progress) as show:
+    with as_on_the_host(x64=False), _shown(progress) as show:
+        clouds = one(src, "src", viewpoint=src_viewpoint), one(dst, "dst", viewpoint=dst_viewpoint)
+        pair = Pair(clouds[0].scaled(size), clouds[1], size, voxel_size)
+        described = None if descriptors is None else _descriptors(descriptors, clouds)
+        search = Search(pair, described, None if seconds is None else start + seconds)
+        pair.seconds["reading"] = time.perf_counter() - start
         ask = _Ask(refine, tolerance, initial_error is not None, show)
         if initial is None:
             outcome = _with_part(search, ask, *_searched(search, ask))
         else:
             outcome = _near(search, _guess(pair, initial, initial_error), ask)
-    return _answer(search, clouds, ask, outcome)
+        return _answer(search, clouds, ask, outcome)
 
 
 class _Ask(NamedTuple):

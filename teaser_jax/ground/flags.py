@@ -11,8 +11,10 @@ from teaser_jax.ground.forks import check_fork
 
 
 @contextmanager
-def as_on_the_host() -> Iterator[None]:
+def as_on_the_host(*, x64: bool = True) -> Iterator[None]:
     """Compute in float64, compiled, with transfers allowed, whatever this thread has JAX set to.
+
+    Without ``x64`` programs compute in float32, and that whatever JAX is set to, too.
 
     The doors of the host send numpy arrays and fetch numpy arrays: a guard against transfers is not meant for
     them. Programs that run operation by operation (``jax_disable_jit``) take minutes, and NaN may stand in
@@ -23,7 +25,7 @@ def as_on_the_host() -> Iterator[None]:
     """
     check_fork()
     with (
-        jax.enable_x64(True),
+        jax.enable_x64(x64),
         jax.transfer_guard("allow"),
         jax.disable_jit(False),
         jax.debug_nans(False),
