@@ -84,7 +84,7 @@ def test_more_columns_and_records_are_read():
         (np.zeros((0, 3)), "0 points that can be used"),
         (np.zeros((500, 2)), r"shape \(500, 2\)"),
         (np.zeros(500), r"shape \(500,\)"),
-        ("scan", "scan has dtype"),
+        ("scan", "no such file"),
     ],
 )
 def test_what_is_no_cloud_is_refused_in_words(given, said: str):

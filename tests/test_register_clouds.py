@@ -119,7 +119,9 @@ def test_a_guess_is_refined_and_not_left():
     assert len(found.candidates) == 1
     assert furthest(found, MOVED, SRC) < 2
     far = tj.Pose(TRUE.rotation, TRUE.translation + [9.0, 0, 0], 1.0)
-    assert not tj.register_clouds(MOVED, DST, initial=far, initial_error=0.5).ok
+    found = tj.register_clouds(MOVED, DST, initial=far, initial_error=0.5)
+    assert not found.ok
+    assert found.doubt == "guess"
 
 
 def test_a_guess_rules_out_the_other_way_round():

@@ -192,10 +192,12 @@ def _near(search: Search, guess: Guess, ask: _Ask) -> _Outcome:
         pose = align(pose, src, dst, reach=reach)
         reach /= 2
     some = src.points[:: max(1, len(src) // SOME)]
-    if np.linalg.norm(moved(pose, some) - moved(guess.pose, some), axis=1).mean() > guess.error:
-        pose = guess.pose
-    found = [search.compared(pair.given(pose), "the initial pose", None)]
-    return _Outcome(found, _judge(found, pair, ask, guess))
+    is_near = lambda x: np.linalg.norm(moved(x, some) - moved(guess.pose, some), axis=1).mean() <= guess.error
+    found = [search.compared(pair.given(pose if is_near(pose) else guess.pose), "the initial pose", None)]
+    judged = _judge(found, pair, ask, guess)
+    if ask.is_certain and not is_near(judged.pose):
+        judged = replace(judged, verdict=Verdict(Status.NO_CONSENSUS, "guess"))
+    return _Outcome(found, judged)
 
 
 def _judge(found: list[Candidate], pair: Pair, ask: _Ask, guess: Guess | None = None) -> Judged:

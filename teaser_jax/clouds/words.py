@@ -99,9 +99,17 @@ def _of_viewpoint(result: CloudRegistration, e: Evidence) -> str:
     )
 
 
+def _of_guess(result: CloudRegistration, e: Evidence) -> str:
+    return (
+        "The clouds are drawn to a pose further from the initial one than initial_error: give a larger one "
+        "if that may be, or no initial pose, to look everywhere."
+    )
+
+
 _OF_DOUBT = {
     "cells": _of_cells, "fit": _of_fit, "free": _of_free, "rival": _of_rival, "own": _of_own,
     "tolerance": _of_tolerance, "part": _of_part, "viewpoint": _of_viewpoint,
+    "guess": _of_guess,
 }  # fmt: skip
 
 

@@ -79,7 +79,7 @@ class Evidence:
 
 
 Doubt: TypeAlias = Literal[
-    "matches", "cells", "fit", "free", "rival", "own", "tolerance", "part", "viewpoint"
+    "matches", "cells", "fit", "free", "rival", "own", "tolerance", "part", "viewpoint", "guess"
 ]
 
 
@@ -90,7 +90,7 @@ class Verdict(NamedTuple):
     part of the overlap; "free": a motion that the normals do not see; "rival": another pose explains as much;
     "own": too little is explained by this pose alone; "tolerance": it holds, and less precisely than asked
     for; "part": a part is not what was scanned, or not found; "viewpoint": it is, if the camera stood where
-    the scan suggests.
+    the scan suggests; "guess": the pose lies further from the initial one than that was said to be off.
     """
 
     status: Status
