@@ -17,7 +17,7 @@ from oracles import random_pose
 
 import teaser_jax as tj
 from teaser_jax import plots
-from teaser_jax.cli.places import draw_clouds, write_page
+from teaser_jax.cli.places import draw_clouds, write_page, writing
 from teaser_jax.plots.scene import principal_axes, scene_of, thinned
 
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
@@ -195,8 +195,8 @@ def test_files_are_written_whole_or_not_at_all(answers, tmp_path: Path, monkeypa
     assert set(before) == {"a.png", "a.html"}
     broken = lambda *_: (_ for _ in ()).throw(RuntimeError("broken"))
     monkeypatch.setattr(Path, "replace", broken)
-    with pytest.raises(RuntimeError, match="broken"):
-        draw_clouds(tmp_path / "a.png", answers["not ok"])
+    with pytest.raises(RuntimeError, match="broken"), writing(tmp_path / "a.png") as partial:
+        draw_clouds(partial, answers["not ok"])
     with pytest.raises(RuntimeError, match="broken"):
         plots.write_view(tmp_path / "a.html", answers["not ok"])
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
