@@ -106,6 +106,13 @@ def test_options_that_make_no_sense_are_refused(options: dict, said: str):
         as_cloud(terrain(0, 300), **options)
 
 
+@pytest.mark.parametrize("unit", [1e300, 1e-300])
+def test_a_unit_that_no_one_can_square_is_refused(unit: float, capfd):
+    with pytest.raises(ValueError, match="in a sensible unit"):
+        as_cloud(unit * terrain(0, 300))
+    assert capfd.readouterr() == ("", "")
+
+
 def test_cells_are_counted_and_their_means_are_taken():
     points = terrain(0, 3000)
     cells, place = np.unique(np.floor((points - points.min(axis=0)) / 0.7), axis=0, return_inverse=True)

@@ -16,6 +16,7 @@ from teaser_jax.reading import coordinates_of, real_numbers
 FEWEST = 100  # points of which a shape can be told
 # Strays lie further outside the box of the middle 98 % of the points than that box is long.
 TAIL = 1.0  # percent, at each end
+LEAST_EXTENT, MOST_EXTENT = 1e-100, 1e100  # squares of lengths are numbers still
 ASKED = 50_000  # points that tell where the middle is
 ODD = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)  # numbers that mix bits well
 
@@ -128,6 +129,9 @@ def as_cloud(
             f"{name} has {len(kept)} points that can be used, of {len(points)} (left out: {left_out}): at "
             f"least {FEWEST} are needed."
         )
+    extent = float(np.ptp(points[kept], axis=0).max())
+    if not LEAST_EXTENT < extent < MOST_EXTENT:
+        raise ValueError(f"{name} is {extent:.3g} across: give it in a sensible unit.")
     # Nothing is rounded: what is taken away is of the size of what it is taken from, or both are small.
     origin = np.median(points[kept], axis=0)
     eye = None if eye is None else eye - origin

@@ -33,7 +33,9 @@ def downsample(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Float[np.
             f"voxel_size is {voxel_size:.3g} in a cloud that reaches {np.abs(points).max():.3g}: more than a "
             "million cells a side. Give a larger one, or leave it out."
         )
-    return np.array(small_gicp().voxelgrid_sampling(points, voxel_size).points()[:, :3])
+    # In units of a cell, as the library takes small widths for none at all.
+    found = small_gicp().voxelgrid_sampling(points / voxel_size, 1.0)
+    return voxel_size * np.array(found.points()[:, :3])
 
 
 def count_cells(points: Float[np.ndarray, "n 3"], voxel_size: float) -> int:
