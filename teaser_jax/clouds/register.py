@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from teaser_jax.clouds.candidates import MOST_CELLS, Candidate, Search, candidates
+from teaser_jax.clouds.candidates import ENOUGH, MOST_CELLS, Candidate, Search, candidates
 from teaser_jax.clouds.cloud import as_cloud
 from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.pair import Pair
@@ -30,7 +30,6 @@ from teaser_jax.pose import Pose, as_pose
 from teaser_jax.reading import known_scale, real_numbers
 from teaser_jax.solution import Status
 
-ENOUGH = 0.30  # a fit that deserves a verdict at once
 MATCHES_AGAIN = ("fit", "own")  # doubts that other matches may dispel
 OTHERS = 6  # candidates that are tried as rivals
 USUAL_ERROR = 3.0  # cells, of an initial pose of which no error is given
