@@ -143,7 +143,7 @@ def test_what_stands_in_a_room_puts_its_pose_ahead_of_the_other_way_round():
     half = motion([0, 0, np.pi], [0, 0, 0])
     for built, ahead in ((room, False), (furnished, True)):
         src, dst = (surface(on_faces(s, 30_000, built), 0.1) for s in (0, 1))
-        forth, back = lead(STILL, half, src, dst), lead(half, STILL, src, dst)
+        forth, back = (lead(*both_ways(a, src, dst), b, src, dst) for a, b in ((STILL, half), (half, STILL)))
         assert forth.share == pytest.approx(-back.share, abs=0.02)  # cells have the weights of their pose
         assert (forth.share > 0.05) == ahead
         assert (forth.against < 0.3) == ahead
@@ -151,7 +151,7 @@ def test_what_stands_in_a_room_puts_its_pose_ahead_of_the_other_way_round():
 
 def test_cells_that_leave_the_other_cloud_say_nothing():
     src, dst = (surface(plane(s, 30_000), 0.1) for s in (0, 1))
-    found = lead(STILL, motion([0, 0, 0], [1.5, 0, 0]), src, dst)
+    found = lead(*both_ways(STILL, src, dst), motion([0, 0, 0], [1.5, 0, 0]), src, dst)
     assert abs(found.share) < 0.02
 
 

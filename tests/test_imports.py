@@ -46,7 +46,7 @@ ORDER = [
     "files.formats.bare", "files.formats.las", "files.formats.e57", "files.clouds",
     "clouds.extra", "clouds.sizes", "clouds.neighbours", "clouds.cloud", "clouds.voxel",
     "clouds.features.normals", "clouds.features.fpfh", "clouds.features.matching", "clouds.surface",
-    "clouds.prepared", "clouds.fine", "clouds.trust.pairing", "clouds.pair", "clouds.trust.observability",
+    "clouds.prepared", "clouds.trust.pairing", "clouds.fine", "clouds.pair", "clouds.trust.observability",
     "clouds.trust.alternatives", "clouds.trust.lead", "clouds.trust.rivals", "clouds.trust.judge",
     "clouds.several", "clouds.candidates",
     "clouds.symmetry", "clouds.parts.closed", "clouds.parts.turns", "clouds.parts.field",

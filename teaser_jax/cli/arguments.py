@@ -77,11 +77,7 @@ def _add_register(register: argparse.ArgumentParser) -> None:
 def _add_clouds(register: argparse._ArgumentGroup) -> None:
     absent = argparse.SUPPRESS
     for name, metavar, text in (
-        (
-            "voxel-size",
-            "V",
-            "width of the cells that the verdict rests on (default: chosen)",
-        ),
+        ("voxel-size", "V", "width of the cells that the verdict rests on (default: chosen)"),
         ("tolerance", "L", "how far points of the overlap may be off at the most (default: two voxels)"),
         ("initial-error", "L", "how far the initial pose may have points of the overlap off"),
         ("max-range", "L", "leave out points further from the viewpoint, or the origin"),

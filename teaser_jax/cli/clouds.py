@@ -15,11 +15,10 @@ import numpy as np
 import teaser_jax as tj
 from teaser_jax.cli.endings import OK, UNTRUSTED, BadInput
 from teaser_jax.cli.places import (
-    check_matplotlib,
-    check_plotly,
-    check_writable,
+    check_places,
     draw_clouds,
     failures_named,
+    tell_unwritten,
     write_page,
     writing,
 )
@@ -50,14 +49,13 @@ def run(arguments: argparse.Namespace) -> int:
     check_kind(arguments, MATCHES_ONLY, "a file of matches")
     given = vars(arguments)
     places = {name: given.get(name) for name in ("output", "plot", "html", "merged")}
-    _check_places((arguments.source, arguments.target), places)
+    check_places((arguments.source, arguments.target), places)
     src, dst = _read(arguments.source), _read(arguments.target)
     result = _answer(arguments, src, dst)
     older = places["output"] is not None and places["output"].exists()
     _write(result, src, dst, places, f"{arguments.source.name} in the frame of {arguments.target.name}")
-    if places["output"] is not None and not result.ok:
-        what = "not written, and the older file removed" if older else "not written"
-        print(f"teaser-jax: {one_line(places['output'])} {what}: {result.status.name}", file=sys.stderr)
+    if not result.ok:
+        tell_unwritten(places["output"], older, result.status.name)
     print(json.dumps(clouds_as_plain_data(result), allow_nan=False) if arguments.json else result)
     return OK if result.ok else UNTRUSTED
 
@@ -68,23 +66,6 @@ def check_kind(arguments: argparse.Namespace, others: Collection[str], what: str
         if name in vars(arguments):
             option = "no-refine" if name == "refine" else name.replace("_", "-")
             raise BadInput(f"--{option} belongs to {what}, see teaser-jax register --help")
-
-
-def _check_places(sources: tuple[Path, Path], places: dict[str, Path | None]) -> None:
-    """Raise BadInput before the work if its answer has no place to go."""
-    seen: dict[Path, str] = {}
-    for name, path in places.items():
-        if path is None:
-            continue
-        for source in sources:
-            check_writable(path, source)
-        if path.resolve() in seen:
-            raise BadInput(f"{path}: is named for --{seen[path.resolve()]} and --{name}: name two files")
-        seen[path.resolve()] = name
-    if places["plot"] is not None:
-        check_matplotlib()
-    if places["html"] is not None:
-        check_plotly()
 
 
 def _read(path: Path) -> CloudFile:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,25 +13,44 @@ import numpy as np
 from teaser_jax.cli.endings import BadInput
 from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.ground.extras import needed
-from teaser_jax.ground.io import replacing
+from teaser_jax.ground.io import one_line, replacing
 from teaser_jax.register import Registration
 
+# What the options that name files are for.
+WORDS = {"output": "pose", "plot": "picture", "html": "page", "merged": "merged cloud"}
 
-def check_places(source: Path, output: Path | None, plot: Path | None) -> None:
+
+def check_places(sources: Sequence[Path], places: Mapping[str, Path | None]) -> None:
     """Raise BadInput before the work, not after it, if its answer has no place to go.
 
     Args:
-        source: The file of matches, which must not be written over.
-        output: Where the pose goes, or None.
-        plot: Where the picture goes, or None.
+        sources: Files that are read, which must not be written over.
+        places: Where to write, by the option that names it; None: nowhere.
     """
-    for path in (output, plot):
-        if path is not None:
+    asked = {name: path for name, path in places.items() if path is not None}
+    for path in asked.values():
+        for source in sources:
             check_writable(path, source)
-    if plot is not None:
+    if "plot" in asked:
         check_matplotlib()
-    if output is not None and plot is not None and os.path.realpath(output) == os.path.realpath(plot):
-        raise BadInput(f"{output}: is named for the pose and for the picture: name two files")
+    if "html" in asked:
+        check_plotly()
+    seen: dict[str, str] = {}
+    for name, path in asked.items():
+        place = os.path.realpath(path)
+        if place in seen:
+            first = asked[seen[place]]
+            raise BadInput(
+                f"{first}: is named for the {WORDS[seen[place]]} and for the {WORDS[name]}: name two files"
+            )
+        seen[place] = name
+
+
+def tell_unwritten(output: Path | None, older: bool, status: str) -> None:
+    """Say on stderr that a pose that cannot be trusted was not written."""
+    if output is not None:
+        what = "not written, and the older file removed" if older else "not written"
+        print(f"teaser-jax: {one_line(output)} {what}: {status}", file=sys.stderr)
 
 
 def check_writable(path: Path, source: Path | None = None) -> None:
@@ -52,16 +72,17 @@ def check_writable(path: Path, source: Path | None = None) -> None:
 
 def check_matplotlib() -> None:
     """Raise BadInput if no picture can be drawn."""
-    try:
-        needed("matplotlib.figure", "pictures need matplotlib", "viz")
-    except ImportError as error:
-        raise BadInput(str(error)) from None
+    _check_library("matplotlib.figure", "pictures need matplotlib")
 
 
 def check_plotly() -> None:
     """Raise BadInput if no page can be written."""
+    _check_library("plotly.graph_objects", "pages need plotly")
+
+
+def _check_library(module: str, what: str) -> None:
     try:
-        needed("plotly.graph_objects", "pages need plotly", "viz")
+        needed(module, what, "viz")
     except ImportError as error:
         raise BadInput(str(error)) from None
 

@@ -14,7 +14,7 @@ import teaser_jax as tj
 from teaser_jax.cli import clouds
 from teaser_jax.cli.clouds import CLOUDS_ONLY, check_kind
 from teaser_jax.cli.endings import OK, UNTRUSTED, BadInput
-from teaser_jax.cli.places import check_places, draw, failures_named, writing
+from teaser_jax.cli.places import check_places, draw, failures_named, tell_unwritten, writing
 from teaser_jax.cli.report import as_plain_data, errors_as_text
 from teaser_jax.files.matches import KNOWN, MatchFile, read_matches
 from teaser_jax.files.poses import write_pose
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         return clouds.run(arguments)
     check_kind(arguments, CLOUDS_ONLY, "two clouds")
     source, output, plot = arguments.source, arguments.output, arguments.plot
-    check_places(source, output, plot)
+    check_places((source,), {"output": output, "plot": plot})
     matches = read_matches(source)
     for sentence in matches.ignored:
         print(f"teaser-jax: {one_line(source)}: {sentence}", file=sys.stderr)
@@ -54,9 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     older = output is not None and output.exists()
     # The words come last: whatever fails before, nothing that counts is out yet.
     _write(result, matches, output, plot)
-    if output is not None and not result.ok:
-        what = "not written, and the older file removed" if older else "not written"
-        print(f"teaser-jax: {one_line(output)} {what}: {result.status.name}", file=sys.stderr)
+    if not result.ok:
+        tell_unwritten(output, older, result.status.name)
     if arguments.json:
         print(json.dumps(as_plain_data(result, matches.truth, seconds), allow_nan=False))
     else:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from teaser_jax.clouds.extra import small_gicp
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.trust.pairing import moved
 from teaser_jax.ground.checks import one_of
 
 METHODS = {"gicp": "GICP", "plane": "PLANE_ICP", "point": "ICP"}
@@ -50,8 +51,8 @@ def align(
         translation_epsilon=SETTLED[0] * dst.voxel_size,
         rotation_epsilon=SETTLED[1],
     )
-    moved = np.array(found.T_target_source)
-    return moved if np.isfinite(moved).all() else pose
+    aligned = np.array(found.T_target_source)
+    return aligned if np.isfinite(aligned).all() else pose
 
 
 def _in_reach(pose: Float[np.ndarray, "4 4"], src: Surface, dst: Surface, reach: float) -> Any:
@@ -59,8 +60,7 @@ def _in_reach(pose: Float[np.ndarray, "4 4"], src: Surface, dst: Surface, reach:
 
     The search for the nearest takes longest over points far away from all others.
     """
-    there = src.points @ pose[:3, :3].T + pose[:3, 3]
-    near = dst.tree.in_reach(there, reach)
+    near = dst.tree.in_reach(moved(pose, src.points), reach)
     count = int(np.count_nonzero(near))
     if count < FEWEST:
         return None

@@ -68,10 +68,14 @@ class Prepared:
 
         Some of the points lie further apart than all: where even they lie near enough, no more is asked.
         """
+        if LEAST_SPACINGS * self._spacing_of_some <= width:
+            return width
+        return max(width, LEAST_SPACINGS * self.spacing)
+
+    @cached_property
+    def _spacing_of_some(self) -> float:
         points = self.cloud.points
-        some = points[:: max(1, len(points) // THINNED)]
-        most = LEAST_SPACINGS * spacing(Tree(some, self.threads))
-        return width if most <= width else max(width, LEAST_SPACINGS * self.spacing)
+        return spacing(Tree(points[:: max(1, len(points) // THINNED)], self.threads))
 
     @cached_property
     def _thinned(self) -> tuple[Float[np.ndarray, "n 3"], float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from teaser_jax.clouds.extra import small_gicp
 from teaser_jax.clouds.neighbours import Tree
@@ -38,11 +38,16 @@ def downsample(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Float[np.
     return voxel_size * np.array(found.points()[:, :3])
 
 
-def count_cells(points: Float[np.ndarray, "n 3"], voxel_size: float) -> int:
-    """Count the cells of a grid that hold points."""
+def cells_of(points: Float[np.ndarray, "n 3"], voxel_size: float) -> Int[np.ndarray, " n"]:
+    """Number the cell of a grid that each point lies in."""
     cell = np.floor((points - points.min(axis=0)) / voxel_size).astype(np.int64)
     size = cell.max(axis=0) + 1
-    number = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    return (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+
+
+def count_cells(points: Float[np.ndarray, "n 3"], voxel_size: float) -> int:
+    """Count the cells of a grid that hold points."""
+    number = cells_of(points, voxel_size)
     number.sort()
     return 1 + int(np.count_nonzero(number[1:] != number[:-1]))
 

@@ -13,7 +13,7 @@ from teaser_jax.clouds.cloud import Cloud, as_cloud
 from teaser_jax.clouds.neighbours import Tree
 from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.clouds.trust.pairing import NEAR
-from teaser_jax.clouds.voxel import voxel_size_for
+from teaser_jax.clouds.voxel import cells_of, voxel_size_for
 from teaser_jax.plots.panels import reach_of
 from teaser_jax.pose import Pose
 
@@ -113,9 +113,7 @@ def thinned(points: Float[np.ndarray, "n 3"], most: int) -> Float[np.ndarray, "m
     """Choose at most so many points, one in each cell of a grid, so that no part of a cloud is left bare."""
     if len(points) <= most:
         return points
-    cells = np.floor((points - points.min(axis=0)) / voxel_size_for(points, most)).astype(np.int64)
-    size = cells.max(axis=0) + 1
-    number = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    number = cells_of(points, voxel_size_for(points, most))
     first = np.sort(np.unique(number, return_index=True)[1])
     # The number of cells is met within a few percent only: some more are left out, evenly.
     return points[first[np.linspace(0, len(first) - 1, min(most, len(first))).astype(int)]]

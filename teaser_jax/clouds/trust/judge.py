@@ -133,7 +133,7 @@ def judge(
     with pair.timed("verdict"):
         here, back = both_ways(pose, a, b)
         seen = observability(here)
-        rivals = find_rivals(pose, a, b, here, seen, others)
+        rivals = find_rivals(pose, a, b, here, back, seen, others)
     chosen = here.fits & (here.weight > 0)
     residual = 1.4826 * float(np.median(np.abs(here.residual[chosen]))) if chosen.any() else np.inf
     evidence = Evidence(
@@ -151,7 +151,7 @@ def judge(
     verdict = verdict_of(evidence, tolerance)
     if guess is not None and evidence.fit >= GOOD_FIT and verdict.doubt in ("rival", "own"):
         with pair.timed("verdict"):
-            fewer = find_rivals(pose, a, b, here, seen, others, guess)
+            fewer = find_rivals(pose, a, b, here, back, seen, others, guess)
         evidence = replace(evidence, rivals=fewer)
         verdict = verdict_of(evidence, tolerance)
     return Judged(pose, evidence, verdict)

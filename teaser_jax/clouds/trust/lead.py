@@ -34,27 +34,24 @@ class Lead(NamedTuple):
         return Lead(min(self.share, other.share), max(self.against, other.against))
 
 
-def lead(pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], src: Surface, dst: Surface) -> Lead:
+def lead(here: Pairing, back: Pairing, other: Float[np.ndarray, "4 4"], src: Surface, dst: Surface) -> Lead:
     """Compare what two poses explain, every direction of normals counting the same.
 
     Args:
-        pose, other: From the source to the target frame, as both surfaces stand.
+        here, back: The source laid onto the target by the first pose, and back.
+        other: The second, from the source to the target frame, as both surfaces stand.
         src, dst: The surfaces, of one width of cells.
     """
-    forth = _weights(pose, other, src, dst)
-    back = _weights(np.linalg.inv(pose), np.linalg.inv(other), dst, src)
-    ours, theirs, both = np.add(forth, back)
+    forth = _weights(here, pair(other, src, dst), dst)
+    ours, theirs, both = np.add(forth, _weights(back, pair(np.linalg.inv(other), dst, src), src))
     total = ours + theirs + both
     if total == 0:
         return Lead(0.0, np.inf)
     return Lead(float((ours - theirs) / total), float(theirs / ours) if ours > 0 else np.inf)
 
 
-def _weights(
-    pose: Float[np.ndarray, "4 4"], other: Float[np.ndarray, "4 4"], src: Surface, dst: Surface
-) -> tuple[float, float, float]:
+def _weights(here: Pairing, there: Pairing, dst: Surface) -> tuple[float, float, float]:
     """Weigh the cells that the first explains alone, the other alone, and both."""
-    here, there = pair(pose, src, dst), pair(other, src, dst)
     says_here, says_there = (_would_show(x, dst) for x in (here, there))
     kinds = here.fits & ~there.fits & says_there, there.fits & ~here.fits & says_here, here.fits & there.fits
     ours, theirs, both = (float(here.weight[kind].sum()) for kind in kinds)

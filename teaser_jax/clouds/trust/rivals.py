@@ -63,6 +63,7 @@ def find_rivals(
     src: Surface,
     dst: Surface,
     here: Pairing,
+    back: Pairing,
     seen: Observability,
     others: Sequence[Float[np.ndarray, "4 4"]] = (),
     guess: Guess | None = None,
@@ -72,7 +73,7 @@ def find_rivals(
     Args:
         pose: From the source to the target frame, as both surfaces stand.
         src, dst: The surfaces, of one width of cells.
-        here: The source laid onto the target by the pose.
+        here, back: The source laid onto the target by the pose, and back.
         seen: Which motions the normals see there.
         others: Further candidates.
         guess: What was known beforehand: a pose that contradicts it is no rival.
@@ -93,8 +94,8 @@ def find_rivals(
     apart = lambda motion: np.linalg.norm(moved(motion, some) - some, axis=1).mean()
     motions = motions[[apart(motion) >= DIFFERENT * cell for motion in motions]]
     if guess is not None:
-        back = guess.pose @ np.linalg.inv(pose)  # to where the guess has the points
-        astray = lambda motion: np.linalg.norm(moved(motion, some) - moved(back, some), axis=1).mean()
+        there = moved(guess.pose @ np.linalg.inv(pose), some)  # where the guess has the points
+        astray = lambda motion: np.linalg.norm(moved(motion, some) - there, axis=1).mean()
         motions = motions[[astray(motion) <= guess.error for motion in motions]]
     if len(motions) == 0:
         return NONE
@@ -110,7 +111,7 @@ def find_rivals(
             other = motions[k] @ pose
         share = _share(pair(other, src, dst, asked), ASKED // 2)
         found = found._replace(
-            lead=found.lead.at_worst(lead(pose, other, src, dst)),
+            lead=found.lead.at_worst(lead(here, back, other, src, dst)),
             poses=(*found.poses, other) if share > LIKE else found.poses,
         )
         if share > found.equal or found.fit == 0:
