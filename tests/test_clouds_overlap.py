@@ -13,7 +13,7 @@ from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.lead import Lead, lead
 from teaser_jax.clouds.trust.observability import observability
-from teaser_jax.clouds.trust.pairing import both_ways, direction_weights, pair
+from teaser_jax.clouds.trust.pairing import direction_weights, lay, pair
 from teaser_jax.clouds.voxel import downsample
 
 STILL = np.eye(4)
@@ -31,11 +31,12 @@ def motion(turn, shift) -> np.ndarray:
 
 def test_a_surface_lies_on_another_sample_of_itself():
     src, dst = surface(corner(0, 30_000), 0.05), surface(corner(1, 30_000), 0.05)
-    here, back = both_ways(STILL, src, dst)
+    laid = lay(STILL, src, dst)
+    here, back = laid.here, laid.back
     for one in (here, back):
         assert one.overlap > 0.99
         assert one.fit > 0.95
-    off, _ = both_ways(motion([0, 0, 0], [0.3, 0.3, 0.3]), src, dst)
+    off = lay(motion([0, 0, 0], [0.3, 0.3, 0.3]), src, dst).here
     assert off.fit < 0.2
 
 
@@ -143,7 +144,7 @@ def test_what_stands_in_a_room_puts_its_pose_ahead_of_the_other_way_round():
     half = motion([0, 0, np.pi], [0, 0, 0])
     for built, ahead in ((room, False), (furnished, True)):
         src, dst = (surface(on_faces(s, 30_000, built), 0.1) for s in (0, 1))
-        forth, back = (lead(*both_ways(a, src, dst), b, src, dst) for a, b in ((STILL, half), (half, STILL)))
+        forth, back = (lead(lay(a, src, dst), b) for a, b in ((STILL, half), (half, STILL)))
         assert forth.share == pytest.approx(-back.share, abs=0.02)  # cells have the weights of their pose
         assert (forth.share > 0.05) == ahead
         assert (forth.against < 0.3) == ahead
@@ -151,7 +152,7 @@ def test_what_stands_in_a_room_puts_its_pose_ahead_of_the_other_way_round():
 
 def test_cells_that_leave_the_other_cloud_say_nothing():
     src, dst = (surface(plane(s, 30_000), 0.1) for s in (0, 1))
-    found = lead(*both_ways(STILL, src, dst), motion([0, 0, 0], [1.5, 0, 0]), src, dst)
+    found = lead(lay(STILL, src, dst), motion([0, 0, 0], [1.5, 0, 0]))
     assert abs(found.share) < 0.02
 
 

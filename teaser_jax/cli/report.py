@@ -98,6 +98,7 @@ def clouds_as_plain_data(result: CloudRegistration) -> dict[str, Any]:
             "fine_voxel_size": _plain(e.fine_voxel_size),
             "overlap": _plain(e.overlap),
             "support": _plain(e.support),
+            "in_front": _plain(e.in_front),
             "residual": _plain(e.residual),
             "visible": _plain(e.seen.visible),
             "explained_by_another": _plain(e.rivals.equal),

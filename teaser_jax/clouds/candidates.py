@@ -21,7 +21,8 @@ from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.clouds.several import several_poses
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.judge import CELLS, FEWEST_CELLS
-from teaser_jax.clouds.trust.pairing import both_ways, shares
+from teaser_jax.clouds.trust.pairing import lay, shares
+from teaser_jax.clouds.trust.space import in_front
 from teaser_jax.ground.arrays import AnyArray
 from teaser_jax.pose import Pose
 from teaser_jax.register import Registration, register
@@ -79,6 +80,7 @@ class Candidate:
         pose: From the source to the target, in the frames as given.
         fit: Which part of the overlap fits at the width of the verdict [-].
         cells: How many cells fit.
+        in_front: Which share of the cells lies in front of what the other sensor saw [-]; NaN: unknown.
         found_by: How it was found.
         registration: The answer of ``register`` to the matches, in the frames as given; None: it was found
             in another way.
@@ -87,13 +89,15 @@ class Candidate:
     pose: Pose
     fit: float
     cells: int
+    in_front: float
     found_by: str
     registration: Registration | None
 
     @property
     def score(self) -> float:
-        """What candidates are ranked by: the fit, if there are cells enough to tell."""
-        return self.fit if self.cells >= FEWEST_CELLS else min(self.fit, 0.1)
+        """What candidates are ranked by: the fit, if there are cells enough to tell, and free space."""
+        fit = self.fit if self.cells >= FEWEST_CELLS else min(self.fit, 0.1)
+        return fit if np.isnan(self.in_front) else fit * (1 - self.in_front) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +184,9 @@ class Search:
         pair = self.pair
         src, dst = pair.surfaces(CELLS, MOST_CELLS)
         with pair.timed("alignment"):
-            here, back = both_ways(aligned, src, dst)
-        fit, cells = min(here.fit, back.fit), min(here.count, back.count)
-        return Candidate(pair.given(aligned), fit, cells, found_by, registration)
+            laid = lay(aligned, src, dst)
+            looked_through = in_front(aligned, src, dst, pair.images)
+        return Candidate(pair.given(aligned), laid.fit, laid.count, looked_through, found_by, registration)
 
     def _descriptors(self, src: Surface, dst: Surface) -> tuple[Descriptors, Descriptors]:
         if self.described is None:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.pairing import moved
+from teaser_jax.clouds.trust.space import Images
 from teaser_jax.clouds.voxel import POINTS_A_CELL, count_cells
 from teaser_jax.pose import Pose
 
@@ -76,6 +77,11 @@ class Pair:
                 x.surface(width, quick=quick) if part is None else x.cut(part, width, quick)
                 for x, part in ((self.src, near_src), (self.dst, near_dst))
             )
+
+    @property
+    def images(self) -> Images:
+        """What the sensor of each cloud saw; None: where it stood is not known."""
+        return self.src.range_image, self.dst.range_image
 
     def centred(self, pose: Pose) -> Float[np.ndarray, "4 4"]:
         """Write a pose between the frames as given as one between the middles."""

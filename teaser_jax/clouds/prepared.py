@@ -13,6 +13,7 @@ from jaxtyping import Float
 from teaser_jax.clouds.cloud import Cloud, as_cloud
 from teaser_jax.clouds.neighbours import Tree
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.clouds.trust.space import RangeImage, range_image
 from teaser_jax.clouds.voxel import LEAST_SPACINGS, POINTS_A_CELL, downsample, spacing, voxel_size_for
 from teaser_jax.ground.checks import whole_number
 from teaser_jax.ground.flags import as_on_the_host
@@ -93,6 +94,12 @@ class Prepared:
         """Some of the points, which tell where the cloud is [length]."""
         points = self.cloud.points
         return points[:: max(1, len(points) // ROUGHLY)]
+
+    @cached_property
+    def range_image(self) -> RangeImage | None:
+        """How far its sensor saw in every direction; None: where that stood is not known."""
+        eye = self.cloud.viewpoint
+        return None if eye is None else range_image(self.cloud.points, eye)
 
     def next_step(self, width: float) -> float:
         """Find the next width, not below this one, that a kept cloud is cut at [length]."""

@@ -30,7 +30,7 @@ from teaser_jax.pose import Pose, as_pose
 from teaser_jax.reading import known_scale, real_numbers
 from teaser_jax.solution import Status
 
-MATCHES_AGAIN = ("fit", "own")  # doubts that other matches may dispel
+MATCHES_AGAIN = ("fit", "space", "own")  # doubts that other matches may dispel
 OTHERS = 6  # candidates that are tried as rivals
 USUAL_ERROR = 3.0  # cells, of an initial pose of which no error is given
 NEAREST_REACH = 2.0  # cells, from which surfaces draw a pose in any case

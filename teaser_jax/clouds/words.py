@@ -48,6 +48,14 @@ def _of_fit(result: CloudRegistration, e: Evidence) -> str:
     )
 
 
+def _of_space(result: CloudRegistration, e: Evidence) -> str:
+    return (
+        f"The clouds fit, and {e.in_front:.0%} of one lies where the sensor of the other looked through: it "
+        "cannot be there. They may not show one place; or src_viewpoint or dst_viewpoint is not where that "
+        "sensor stood, as in a cloud merged of several scans (then leave it out)."
+    )
+
+
 def _of_free(result: CloudRegistration, e: Evidence) -> str:
     motions = "; ".join(str(motion) for motion in result.free)
     return (
@@ -107,8 +115,8 @@ def _of_guess(result: CloudRegistration, e: Evidence) -> str:
 
 
 _OF_DOUBT = {
-    "cells": _of_cells, "fit": _of_fit, "free": _of_free, "rival": _of_rival, "own": _of_own,
-    "tolerance": _of_tolerance, "part": _of_part, "viewpoint": _of_viewpoint,
+    "cells": _of_cells, "fit": _of_fit, "space": _of_space, "free": _of_free, "rival": _of_rival,
+    "own": _of_own, "tolerance": _of_tolerance, "part": _of_part, "viewpoint": _of_viewpoint,
     "guess": _of_guess,
 }  # fmt: skip
 
@@ -137,6 +145,7 @@ def _evidence(result: CloudRegistration, e: Evidence) -> list[str]:
         f"  accuracy     {_short(e.displacement)} expected, in cells of {_short(e.voxel_size)}",
         f"  fit          {e.fit:.0%} of the overlap, {finer}",
         f"  overlap      {e.overlap:.0%} of the clouds; {e.cells} cells fit",
+        *([] if np.isnan(e.in_front) else [f"  free space   {e.in_front:.1%} in front of what a sensor saw"]),
         f"  held         the least visible motion by {held:.1%}",
         f"  rivals       the best other pose explains {e.rivals.equal:.0%} of what fits",
         f"  candidates   {result.agreement} of {len(result.candidates)} agree: {first.found_by}",

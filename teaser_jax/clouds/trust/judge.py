@@ -1,8 +1,8 @@
 """Whether a pose between two clouds deserves trust: does it fit, does it hold, and does nothing else fit?
 
-Matches can be wrong together; the clouds themselves tell. Five questions: are there cells enough, do they
-fit at two widths, do their normals hold all six motions, does the overlap fit as well in another pose, and
-how much of the fit is explained by no other pose.
+Matches can be wrong together; the clouds themselves tell. Six questions: are there cells enough, do they
+fit at two widths, do they leave free what the sensors looked through, do their normals hold all six motions,
+does the overlap fit as well in another pose, and how much of the fit is explained by no other pose.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.pair import Pair
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.observability import Observability, observability
-from teaser_jax.clouds.trust.pairing import both_ways
-from teaser_jax.clouds.trust.rivals import Guess, Rivals, find_rivals
+from teaser_jax.clouds.trust.pairing import lay
+from teaser_jax.clouds.trust.rivals import MOST_IN_FRONT, Guess, Rivals, find_rivals
+from teaser_jax.clouds.trust.space import in_front
 from teaser_jax.solution import Status
 
 CELLS, MOST_CELLS = 6000, 10**9  # of the smaller cloud; a map may have as many as it needs
@@ -51,6 +52,8 @@ class Evidence:
             smaller of both ways [-]; at the finer width, too.
         overlap: Which part of either cloud lies in the overlap, the smaller one [-].
         support: Which part of either cloud fits, the smaller one [-].
+        in_front: Which part of either cloud lies in front of what the other sensor saw, the larger one [-];
+            NaN: no viewpoint is known.
         residual: How far the surfaces lie apart along their normals [length].
         seen: Which motions the normals see.
         rivals: What other poses explain.
@@ -63,6 +66,7 @@ class Evidence:
     fine_fit: float
     overlap: float
     support: float
+    in_front: float
     residual: float
     seen: Observability
     rivals: Rivals
@@ -79,7 +83,7 @@ class Evidence:
 
 
 Doubt: TypeAlias = Literal[
-    "matches", "cells", "fit", "free", "rival", "own", "tolerance", "part", "viewpoint", "guess"
+    "matches", "cells", "fit", "space", "free", "rival", "own", "tolerance", "part", "viewpoint", "guess"
 ]
 
 
@@ -87,10 +91,11 @@ class Verdict(NamedTuple):
     """Whether to trust a pose, and which question it failed; None: none.
 
     "matches": there is no pose, as no points look alike; "cells": too few of them fit; "fit": too small a
-    part of the overlap; "free": a motion that the normals do not see; "rival": another pose explains as much;
-    "own": too little is explained by this pose alone; "tolerance": it holds, and less precisely than asked
-    for; "part": a part is not what was scanned, or not found; "viewpoint": it is, if the camera stood where
-    the scan suggests; "guess": the pose lies further from the initial one than that was said to be off.
+    part of the overlap; "space": too much lies where a sensor looked through; "free": a motion that the
+    normals do not see; "rival": another pose explains as much; "own": too little is explained by this pose
+    alone; "tolerance": it holds, and less precisely than asked for; "part": a part is not what was scanned,
+    or not found; "viewpoint": it is, if the camera stood where the scan suggests; "guess": the pose lies
+    further from the initial one than that was said to be off.
     """
 
     status: Status
@@ -131,27 +136,26 @@ def judge(
     finer = _at_finer_cells(pose, pair, a, b, refine)
     pose = finer.pose
     with pair.timed("verdict"):
-        here, back = both_ways(pose, a, b)
-        seen = observability(here)
-        rivals = find_rivals(pose, a, b, here, back, seen, others)
-    chosen = here.fits & (here.weight > 0)
-    residual = 1.4826 * float(np.median(np.abs(here.residual[chosen]))) if chosen.any() else np.inf
+        laid = lay(pose, a, b)
+        seen = observability(laid.here)
+        rivals = find_rivals(laid, seen, others, images=pair.images)
     evidence = Evidence(
         voxel_size=b.voxel_size,
         fine_voxel_size=finer.voxel_size,
-        cells=min(here.count, back.count),
-        fit=min(here.fit, back.fit),
+        cells=laid.count,
+        fit=laid.fit,
         fine_fit=finer.fit,
-        overlap=min(here.overlap, back.overlap),
-        support=min(here.support, back.support),
-        residual=residual,
+        overlap=laid.overlap,
+        support=laid.support,
+        in_front=in_front(pose, a, b, pair.images),
+        residual=laid.residual,
         seen=seen,
         rivals=rivals,
     )
     verdict = verdict_of(evidence, tolerance)
     if guess is not None and evidence.fit >= GOOD_FIT and verdict.doubt in ("rival", "own"):
         with pair.timed("verdict"):
-            fewer = find_rivals(pose, a, b, here, back, seen, others, guess)
+            fewer = find_rivals(laid, seen, others, images=pair.images, guess=guess)
         evidence = replace(evidence, rivals=fewer)
         verdict = verdict_of(evidence, tolerance)
     return Judged(pose, evidence, verdict)
@@ -169,6 +173,8 @@ def verdict_of(evidence: Evidence, tolerance: float | None = None) -> Verdict:
         return Verdict(Status.NO_CONSENSUS, "cells")
     if e.fit < LEAST_FIT or e.fine_fit < LEAST_FINE_FIT:
         return Verdict(Status.NO_CONSENSUS, "fit")
+    if e.in_front > MOST_IN_FRONT:
+        return Verdict(Status.NO_CONSENSUS, "space")
     if e.seen.visible[0] < LEAST_VISIBLE:
         return Verdict(Status.DEGENERATE, "free")
     ahead = e.rivals.lead.share >= ENOUGH_LEAD and e.rivals.lead.against <= MOST_AGAINST
@@ -201,9 +207,9 @@ def _at_finer_cells(
     if pair.width(FINE_CELLS, MOST_FINE_CELLS) < FINER * dst.voxel_size:
         a, b = pair.surfaces_near(pose, FINE_CELLS, MOST_FINE_CELLS, quick=True)
     with pair.timed("alignment"):
-        before = min(x.fit for x in both_ways(pose, a, b, FINE_ASKED))
+        before = lay(pose, a, b, FINE_ASKED).fit
         if refine is None:
             return _Finer(pose, b.voxel_size, before)
         other = align(pose, a, b, method=refine)
-        after = min(x.fit for x in both_ways(other, a, b, FINE_ASKED))
+        after = lay(other, a, b, FINE_ASKED).fit
     return _Finer(other, b.voxel_size, after) if after >= before else _Finer(pose, b.voxel_size, before)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from teaser_jax.clouds.surface import Surface
-from teaser_jax.clouds.trust.pairing import ACROSS, ALIGNED, LINES, Pairing, pair
+from teaser_jax.clouds.trust.pairing import ACROSS, ALIGNED, LINES, Laid, Pairing, pair
 
 MARGIN = 3.0  # cells: so far inside the hull of a cloud must a cell lie to say anything
 
@@ -34,16 +34,16 @@ class Lead(NamedTuple):
         return Lead(min(self.share, other.share), max(self.against, other.against))
 
 
-def lead(here: Pairing, back: Pairing, other: Float[np.ndarray, "4 4"], src: Surface, dst: Surface) -> Lead:
+def lead(laid: Laid, other: Float[np.ndarray, "4 4"]) -> Lead:
     """Compare what two poses explain, every direction of normals counting the same.
 
     Args:
-        here, back: The source laid onto the target by the first pose, and back.
+        laid: The surfaces in the first pose.
         other: The second, from the source to the target frame, as both surfaces stand.
-        src, dst: The surfaces, of one width of cells.
     """
-    forth = _weights(here, pair(other, src, dst), dst)
-    ours, theirs, both = np.add(forth, _weights(back, pair(np.linalg.inv(other), dst, src), src))
+    src, dst = laid.src, laid.dst
+    forth = _weights(laid.here, pair(other, src, dst), dst)
+    ours, theirs, both = np.add(forth, _weights(laid.back, pair(np.linalg.inv(other), dst, src), src))
     total = ours + theirs + both
     if total == 0:
         return Lead(0.0, np.inf)

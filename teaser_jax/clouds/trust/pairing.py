@@ -103,12 +103,55 @@ def moved(pose: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> F
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-def both_ways(
-    pose: Float[np.ndarray, "4 4"], src: Surface, dst: Surface, most: int | None = None
-) -> tuple[Pairing, Pairing]:
-    """Lay each surface onto the other; ``most``: about so many cells of each, evenly chosen."""
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """Two surfaces laid on one another; what is said of both ways is the smaller of the two.
+
+    Attributes:
+        pose: From the source to the target frame, as both surfaces stand.
+        src, dst: The surfaces, of one width of cells.
+        here, back: The source on the target, and the target on the source.
+    """
+
+    pose: Float[np.ndarray, "4 4"]
+    src: Surface
+    dst: Surface
+    here: Pairing
+    back: Pairing
+
+    @property
+    def fit(self) -> float:
+        """Which part of the overlap fits, by weight [-]."""
+        return min(self.here.fit, self.back.fit)
+
+    @property
+    def count(self) -> int:
+        """How many cells fit."""
+        return min(self.here.count, self.back.count)
+
+    @property
+    def overlap(self) -> float:
+        """Which part of either surface lies in the overlap [-]."""
+        return min(self.here.overlap, self.back.overlap)
+
+    @property
+    def residual(self) -> float:
+        """How far the surfaces lie apart along their normals where the source fits [length]."""
+        chosen = self.here.fits & (self.here.weight > 0)
+        # Of the spread of a normal error, the median of its size is so small a part.
+        return float(1.4826 * np.median(np.abs(self.here.residual[chosen]))) if chosen.any() else np.inf
+
+    @property
+    def support(self) -> float:
+        """Which part of either surface fits [-]."""
+        return min(self.here.support, self.back.support)
+
+
+def lay(pose: Float[np.ndarray, "4 4"], src: Surface, dst: Surface, most: int | None = None) -> Laid:
+    """Lay two surfaces on one another; ``most``: about so many cells of each, evenly chosen."""
     rows = lambda x: None if most is None else np.arange(0, len(x), max(1, len(x) // most))
-    return pair(pose, src, dst, rows(src)), pair(np.linalg.inv(pose), dst, src, rows(dst))
+    here, back = pair(pose, src, dst, rows(src)), pair(np.linalg.inv(pose), dst, src, rows(dst))
+    return Laid(pose, src, dst, here, back)
 
 
 def shares(

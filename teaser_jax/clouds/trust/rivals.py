@@ -6,7 +6,7 @@ best about more, and the very best are aligned and compared with the pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,8 @@ from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.alternatives import alternatives
 from teaser_jax.clouds.trust.lead import Lead, lead
 from teaser_jax.clouds.trust.observability import Observability
-from teaser_jax.clouds.trust.pairing import Pairing, both_ways, moved, pair, shares
+from teaser_jax.clouds.trust.pairing import Laid, Pairing, lay, moved, pair, shares
+from teaser_jax.clouds.trust.space import Images, in_front
 
 DIFFERENT = 2.5  # cells of displacement on average that make another pose
 ASKED, SCREENED, FIRST_LOOK = 400, 200, 50  # cells asked of alternatives: the last, the better, all
@@ -25,6 +26,8 @@ LOOKED_AT_TWICE, TRIED = 60, 6  # alternatives; those that are aligned
 ALIGNED_CELLS = 1500  # of those that fit, to align them elsewhere
 WORTH_A_TRY = 0.3  # of the cells asked
 LIKE = 0.80  # a share of the fitting cells that makes a pose as good
+# Of the cells in front of what the other sensor saw: right poses have 0.06 at most, wrong ones mostly more.
+MOST_IN_FRONT = 0.10
 
 
 class Rivals(NamedTuple):
@@ -59,25 +62,23 @@ NONE = Rivals(0.0, 0.0, Lead(1.0, 0.0), ())
 
 
 def find_rivals(
-    pose: Float[np.ndarray, "4 4"],
-    src: Surface,
-    dst: Surface,
-    here: Pairing,
-    back: Pairing,
+    laid: Laid,
     seen: Observability,
     others: Sequence[Float[np.ndarray, "4 4"]] = (),
+    *,
+    images: Images = (None, None),
     guess: Guess | None = None,
 ) -> Rivals:
     """Look for other poses in which the fitting cells fit as well.
 
     Args:
-        pose: From the source to the target frame, as both surfaces stand.
-        src, dst: The surfaces, of one width of cells.
-        here, back: The source laid onto the target by the pose, and back.
+        laid: The surfaces in the pose.
         seen: Which motions the normals see there.
         others: Further candidates.
+        images: What the sensors saw: a pose that has much in front of that is no rival.
         guess: What was known beforehand: a pose that contradicts it is no rival.
     """
+    pose, src, dst, here = laid.pose, laid.src, laid.dst, laid.here
     chosen = np.flatnonzero(here.fits & (here.weight > 0))
     if len(chosen) < 20:
         return NONE
@@ -103,20 +104,34 @@ def find_rivals(
     fitting = Surface(src.points[every], cell, threads=src.threads)  # what another pose has to explain
     quick = _screened(motions @ pose, src, dst, asked)
     found = Rivals(min(float(quick.max()), WORTH_A_TRY), 0.0, NONE.lead, ())
-    for k in np.argsort(-quick, kind="stable")[:TRIED]:
-        if quick[k] <= WORTH_A_TRY:
-            break
-        other = align(align(motions[k] @ pose, fitting, dst, reach=4.0), fitting, dst)
-        if apart(other @ np.linalg.inv(pose)) < DIFFERENT * cell:  # it fell back: judge it where it stood
-            other = motions[k] @ pose
+    for other in _possible(motions @ pose, quick, laid, images):
+        aligned = align(align(other, fitting, dst, reach=4.0), fitting, dst)
+        if (
+            apart(aligned @ np.linalg.inv(pose)) >= DIFFERENT * cell
+        ):  # else it fell back: judge where it stood
+            other = aligned
         share = _share(pair(other, src, dst, asked), ASKED // 2)
         found = found._replace(
-            lead=found.lead.at_worst(lead(here, back, other, src, dst)),
+            lead=found.lead.at_worst(lead(laid, other)),
             poses=(*found.poses, other) if share > LIKE else found.poses,
         )
         if share > found.equal or found.fit == 0:
-            found = found._replace(equal=share, fit=min(x.fit for x in both_ways(other, src, dst)))
+            found = found._replace(equal=share, fit=lay(other, src, dst).fit)
     return found
+
+
+def _possible(
+    poses: Float[np.ndarray, "k 4 4"], share: Float[np.ndarray, " k"], laid: Laid, images: Images
+) -> Iterator[Float[np.ndarray, "4 4"]]:
+    """List the poses that are worth a try, the best first, without those that free space rules out."""
+    limit = max(MOST_IN_FRONT, 2 * np.nan_to_num(in_front(laid.pose, laid.src, laid.dst, images)))
+    tried = 0
+    for k in np.argsort(-share, kind="stable"):
+        if tried == TRIED or share[k] <= WORTH_A_TRY:
+            return
+        if not in_front(poses[k], laid.src, laid.dst, images) > limit:  # NaN: nothing is known
+            tried += 1
+            yield poses[k]
 
 
 def _screened(
