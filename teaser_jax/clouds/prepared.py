@@ -162,6 +162,16 @@ def prepare(
     return Prepared(read, threads_or_all(threads), is_kept=True)
 
 
+def as_prepared(cloud: Any, name: str, threads: int, **options: Any) -> Prepared:
+    """Read a cloud, or take one that was prepared."""
+    if not isinstance(cloud, Prepared):
+        return Prepared(as_cloud(cloud, name, **options), threads)
+    given = [option for option, value in options.items() if value is not None]
+    if given:
+        raise ValueError(f"{name} was prepared already: give {' and '.join(given)} to prepare.")
+    return cloud
+
+
 def threads_or_all(threads: int | None) -> int:
     """Read a number of threads; None: as many as there are cores for this process."""
     if threads is not None:

@@ -13,11 +13,10 @@ import numpy as np
 from tqdm import tqdm
 
 from teaser_jax.clouds.candidates import ENOUGH, MOST_CELLS, Candidate, Search, candidates
-from teaser_jax.clouds.cloud import as_cloud
 from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.pair import Pair
 from teaser_jax.clouds.parts.answer import part_answer
-from teaser_jax.clouds.prepared import Prepared, threads_or_all
+from teaser_jax.clouds.prepared import Prepared, as_prepared, threads_or_all
 from teaser_jax.clouds.registration import CloudRegistration
 from teaser_jax.clouds.symmetry import Axis
 from teaser_jax.clouds.trust.judge import CELLS, Judged, Verdict, judge
@@ -106,7 +105,7 @@ def register_clouds(
     if initial is None and initial_error is not None:
         raise ValueError("initial_error is given without initial: give the pose that may be so far off.")
     size, workers = float(known_scale(scale)), threads_or_all(threads)
-    one = partial(_prepared, crop=crop, max_range=max_range, threads=workers)
+    one = partial(as_prepared, crop=crop, max_range=max_range, threads=workers)
     with as_on_the_host(x64=False), _shown(progress) as show:
         clouds = one(src, "src", viewpoint=src_viewpoint), one(dst, "dst", viewpoint=dst_viewpoint)
         pair = Pair(clouds[0].scaled(size), clouds[1], size, voxel_size)
@@ -233,16 +232,6 @@ def _answer(
         ended_early=search.seconds_left == 0,
         seconds=pair.seconds,
     )
-
-
-def _prepared(cloud: Any, name: str, threads: int, **options: Any) -> Prepared:
-    """Read a cloud, or take one that was prepared."""
-    if not isinstance(cloud, Prepared):
-        return Prepared(as_cloud(cloud, name, **options), threads)
-    given = [option for option, value in options.items() if value is not None]
-    if given:
-        raise ValueError(f"{name} was prepared already: give {' and '.join(given)} to prepare.")
-    return cloud
 
 
 def _guess(pair: Pair, initial: Any, error: float | None) -> Guess:

@@ -19,7 +19,7 @@ from teaser_jax.clouds.pair import Pair
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.observability import Observability, observability
 from teaser_jax.clouds.trust.pairing import lay
-from teaser_jax.clouds.trust.rivals import MOST_IN_FRONT, Guess, Rivals, find_rivals
+from teaser_jax.clouds.trust.rivals import Guess, Rivals, find_rivals
 from teaser_jax.clouds.trust.space import in_front
 from teaser_jax.solution import Status
 
@@ -32,6 +32,7 @@ FEWEST_CELLS = 300
 LEAST_FIT, LEAST_FINE_FIT = 0.20, 0.14
 LEAST_OWN = 0.14
 LEAST_VISIBLE = 0.008
+MOST_IN_FRONT = 0.10
 # What another pose may reach: of the cells that fit, and of the fit.
 MOST_EQUAL, MOST_OF_FIT = 0.80, 0.82
 # Where the pose is so far ahead of all others, it counts whatever they reach: with a cupboard in a box room

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.clouds.trust.pairing import Pairing
+from teaser_jax.ground.arrays import AnyArray, namespace
 
 MOSTLY_SHIFT = 0.5  # of the squared displacement: then a motion is called a slide
 
@@ -85,23 +86,51 @@ def observability(pairing: Pairing) -> Observability:
     if len(weight) < 6:
         return Observability(np.zeros(6), np.eye(6), np.zeros(3))
     points, ours, theirs = (x[chosen] for x in (pairing.points, pairing.normals, pairing.partner_normals))
-    weight = weight / weight.sum()
-    centroid = weight @ points
-    arm = points - centroid
-    size = np.sqrt(np.sum(weight @ arm**2))  # turns are measured by it, or units would decide
-    arm = arm / size
-    a, b = (np.hstack([n, np.cross(arm, n)]) for n in (ours, theirs))
-    seen = (weight[:, None] * a).T @ b
-    spread = (weight[:, None] * arm).T @ arm
-    moved = np.eye(6)
-    moved[3:, 3:] = np.trace(spread) * np.eye(3) - spread + 1e-12 * np.eye(3)
+    return Observability(*seen_by(points, ours, theirs, weight / weight.sum()))
+
+
+def seen_by(
+    points: Float[AnyArray, "n 3"],
+    ours: Float[AnyArray, "n 3"],
+    theirs: Float[AnyArray, "n 3"],
+    weight: Float[AnyArray, " n"],
+) -> tuple[Float[AnyArray, "6"], Float[AnyArray, "6 6"], Float[AnyArray, "3"]]:
+    """Find which motions the normals of two surfaces see, as ``Observability`` has them.
+
+    A pure function: works under jit and vmap.
+
+    Args:
+        points: Where they meet [length].
+        ours, theirs: Unit normals of both surfaces, to one side.
+        weight: Of each point; all add up to 1 [-].
+    """
+    xp = namespace(points)
+    centroid = xp.sum(weight[:, None] * points, axis=0)
+    arm = points - centroid[None]
+    size = xp.sqrt(xp.sum(weight[:, None] * arm**2))  # turns are measured by it, or units would decide
+    arm = arm / xp.where(size > 0, size, 1)
+    a, b = (xp.concatenate([n, xp.cross(arm, n)], axis=1) for n in (ours, theirs))
+    seen = _moments(weight, a, b)
+    spread = _moments(weight, arm, arm)
+    still = xp.eye(3, dtype=points.dtype)
+    none = xp.zeros((3, 3), points.dtype)
+    least = 10 * xp.finfo(points.dtype).eps
+    turned = (xp.trace(spread) + least) * still - spread
+    moved = xp.block([[still, none], [none, turned]])
     # seen x = visible moved x, by the square root of what is moved.
-    values, axes = np.linalg.eigh(moved)
-    root = axes / np.sqrt(values) @ axes.T
-    visible, motions = np.linalg.eigh(root @ ((seen + seen.T) / 2) @ root)
+    values, axes = xp.linalg.eigh(moved)
+    root = axes / xp.sqrt(xp.maximum(values, least))[None] @ axes.T
+    visible, motions = xp.linalg.eigh(root @ ((seen + seen.T) / 2) @ root)
     motions = root @ motions
-    motions[3:] /= size
-    return Observability(np.maximum(visible, 0), motions, centroid)
+    motions = xp.concatenate([motions[:3], motions[3:] / xp.where(size > 0, size, 1)])
+    return xp.maximum(visible, 0), motions, centroid
+
+
+def _moments(
+    weight: Float[AnyArray, " n"], a: Float[AnyArray, "n k"], b: Float[AnyArray, "n k"]
+) -> Float[AnyArray, "k k"]:
+    # As sums: a product of matrices has few digits on some devices.
+    return namespace(a).sum((weight[:, None] * a)[:, :, None] * b[:, None, :], axis=0)
 
 
 def _motion(motion: Float[np.ndarray, "6"], centroid: Float[np.ndarray, "3"]) -> Motion:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from teaser_jax.clouds.surface import Surface
+from teaser_jax.ground.arrays import AnyArray, namespace
 
 # In cells: how far a cell and the nearest one of the other surface lie apart in the overlap, how far where
 # they fit, and how far along the normal; and the cosine between their normals.
@@ -87,15 +89,50 @@ def pair(
 def _compared(
     there: Float[np.ndarray, "n 3"], across: Float[np.ndarray, "n 3"], dst: Surface
 ) -> tuple[np.ndarray, ...]:
-    """Compare cells with the nearest ones of a surface: which, their normals, how far, and what fits."""
+    """Find the nearest cells of a surface: which, their normals, how far, and what fits there."""
     partner, distance = dst.tree.nearest(there, NEAR * dst.voxel_size)
-    theirs = dst.normals[partner]
-    cosine = np.sum(across * theirs, axis=1)
-    theirs = np.where((cosine < 0)[:, None], -theirs, theirs)
-    residual = np.sum((there - dst.points[partner]) * theirs, axis=1)
-    cell = dst.voxel_size
-    fits = (distance < CLOSE * cell) & (np.abs(residual) < ACROSS * cell) & (np.abs(cosine) > ALIGNED)
-    return partner, theirs, distance, residual, distance < NEAR * cell, fits
+    apart, theirs = there - dst.points[partner], dst.normals[partner]
+    _, theirs, residual, fits = compared(apart, distance, across, theirs, dst.voxel_size)
+    return partner, theirs, distance, residual, distance < NEAR * dst.voxel_size, fits
+
+
+class Compared(NamedTuple):
+    """How cells stand to the nearest ones of another surface.
+
+    Attributes:
+        cosine: Between both normals [-].
+        theirs: The normal of the other surface, turned to the side of the first.
+        residual: How far the cell lies before its plane [length].
+        fits: Which cells lie on the other surface, with their normal along its own.
+    """
+
+    cosine: Float[AnyArray, " n"]
+    theirs: Float[AnyArray, "n 3"]
+    residual: Float[AnyArray, " n"]
+    fits: Bool[AnyArray, " n"]
+
+
+def compared(
+    apart: Float[AnyArray, "n 3"],
+    distance: Float[AnyArray, " n"],
+    ours: Float[AnyArray, "n 3"],
+    theirs: Float[AnyArray, "n 3"],
+    cell: float | AnyArray,
+) -> Compared:
+    """Compare cells with the nearest ones of another surface. A pure function: works under jit and vmap.
+
+    Args:
+        apart: From the nearest cell to each [length].
+        distance: How far that is [length].
+        ours, theirs: The normals of the cells and of the nearest ones.
+        cell: Width of the cells [length].
+    """
+    xp = namespace(apart)
+    cosine = xp.sum(ours * theirs, axis=1)
+    theirs = xp.where((cosine < 0)[:, None], -theirs, theirs)
+    residual = xp.sum(apart * theirs, axis=1)
+    fits = (distance < CLOSE * cell) & (xp.abs(residual) < ACROSS * cell) & (xp.abs(cosine) > ALIGNED)
+    return Compared(cosine, theirs, residual, fits)
 
 
 def moved(pose: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -172,16 +209,20 @@ def shares(
     return np.concatenate(found) if found else np.zeros(0)
 
 
-def direction_weights(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def direction_weights(
+    normals: Float[AnyArray, "n 3"], total: AnyArray | None = None
+) -> Float[AnyArray, " n"]:
     """Weigh unit normals so that each direction counts the same: floors and roads would outvote all else.
 
-    Normals and their opposites are one direction. Directions that few have do not count more than two
-    hundredths of all normals would.
+    Normals and their opposites are one direction. Directions that few have do not count more than a
+    two-hundredth of all normals would. ``total``: how many they are without padding; None: there is none.
     """
-    kind = np.argmax(np.abs(normals @ LINES.T), axis=1)
-    some = np.any(normals != 0, axis=1)
-    count = np.bincount(kind[some], minlength=DIRECTIONS)
-    return np.where(some, 1 / np.maximum(count[kind], len(normals) / MOST_WEIGHT), 0)
+    xp = namespace(normals)
+    kind = xp.argmax(xp.abs(normals @ LINES.T.astype(normals.dtype)), axis=1)
+    some = xp.any(normals != 0, axis=1).astype(normals.dtype)
+    length = {} if xp is np else {"length": DIRECTIONS}  # which JAX has to know
+    count = xp.bincount(kind, some, minlength=DIRECTIONS, **length)
+    return some / xp.maximum(count[kind], (len(normals) if total is None else total) / MOST_WEIGHT)
 
 
 def _even_lines(count: int) -> Float[np.ndarray, "k 3"]:

@@ -79,9 +79,10 @@ def sight(
     xp = namespace(points)
     away = points - image.eye[None]
     distance, depth = xp.sqrt(xp.sum(away**2, axis=1)), image.depth[_pixels(away)]
-    there = mask & xp.isfinite(depth)
-    share = lambda kind, of: xp.sum(kind & there) / xp.where(of > 0, of, np.nan)
-    every, asked = xp.sum(mask), xp.sum(there)
+    there = xp.isfinite(depth)
+    number = lambda kind: xp.sum(kind & mask, dtype=points.dtype)
+    share = lambda kind, of: number(kind & there) / xp.where(of > 0, of, np.nan)
+    every, asked = number(mask), number(there)
     # Of few points a share would say much: they count as a tenth of all.
     counted = xp.where(asked > 0, xp.maximum(asked, LEAST_ASKED * every), 0)
     return Sight(
@@ -129,4 +130,4 @@ def _pixels(away: Float[AnyArray, "n 3"]) -> Int[AnyArray, " n"]:
         )
         for k in (1, 2)
     )
-    return ((2 * face + (ahead < 0)) * SIDE + row) * SIDE + column
+    return ((2 * face + xp.where(ahead < 0, 1, 0)) * SIDE + row) * SIDE + column
