@@ -14,6 +14,7 @@ from benchmarks import (
     batch,
     certificate,
     clique,
+    clouds,
     cold,
     gradients,
     growth,
@@ -37,6 +38,7 @@ BENCHMARKS = {
     "accelerator": accelerator,
     "gradients": gradients,
     "learning": learning,
+    "clouds": clouds,
 }
 
 
