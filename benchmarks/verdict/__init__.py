@@ -1,1 +1,1 @@
-"""The verdict on raw clouds, fitted by folds over places on pairs made here: rooms, streets, halls, objects."""
+"""The verdict on raw clouds, fitted by folds over places on pairs made here."""

@@ -42,12 +42,13 @@ def _row(pair: Pair, viewpoints: bool) -> dict[str, Any]:
         return row | dict(answer=pair.truth is not None, right=False, evidence=None)
     near = RIGHT * e.voxel_size
     off = pair.displacement(found.pose, near)
+    row["pose"] = found.T_dst_src.tolist()
     row.update(answer=bool(np.isfinite(off)), off=off / e.voxel_size, right=bool(off < near))
     row["evidence"] = dict(
         cells=e.cells, fit=e.fit, fine_fit=e.fine_fit, overlap=e.overlap, support=e.support,
         in_front=e.in_front, visible=e.seen.visible.tolist(), equal=e.rivals.equal,
         rival_fit=e.rivals.fit, lead=e.rivals.lead.share, against=min(e.rivals.lead.against, 1e9),
-        displacement=e.displacement / e.voxel_size, agreement=found.agreement,
+        displacement=e.displacement / e.voxel_size, beyond_planes=e.beyond_planes, agreement=found.agreement,
         candidates=len(found.candidates),
     )  # fmt: skip
     return row

@@ -20,7 +20,7 @@ from teaser_jax.clouds.pair import Pair
 from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.clouds.several import several_poses
 from teaser_jax.clouds.surface import Surface
-from teaser_jax.clouds.trust.judge import CELLS, FEWEST_CELLS
+from teaser_jax.clouds.trust.judge import CELLS, LIMITS
 from teaser_jax.clouds.trust.pairing import lay, shares
 from teaser_jax.clouds.trust.space import in_front
 from teaser_jax.ground.arrays import AnyArray
@@ -96,7 +96,7 @@ class Candidate:
     @property
     def score(self) -> float:
         """What candidates are ranked by: the fit, if there are cells enough to tell, and free space."""
-        fit = self.fit if self.cells >= FEWEST_CELLS else min(self.fit, 0.1)
+        fit = self.fit if self.cells >= LIMITS.cells else min(self.fit, 0.1)
         return fit if np.isnan(self.in_front) else fit * (1 - self.in_front) ** 2
 
 

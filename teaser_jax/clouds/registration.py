@@ -11,7 +11,7 @@ from jaxtyping import Float
 from teaser_jax.clouds.candidates import Candidate
 from teaser_jax.clouds.cloud import Cloud
 from teaser_jax.clouds.symmetry import Axis
-from teaser_jax.clouds.trust.judge import LEAST_VISIBLE, Doubt, Evidence
+from teaser_jax.clouds.trust.judge import LIMITS, Doubt, Evidence
 from teaser_jax.clouds.trust.observability import Motion
 from teaser_jax.clouds.words import advice, summary
 from teaser_jax.pose import Pose
@@ -77,7 +77,7 @@ class CloudRegistration:
     @property
     def free(self) -> tuple[Motion, ...]:
         """Motions that the clouds do not hold, in the target frame."""
-        free = () if self.evidence is None else self.evidence.seen.free(LEAST_VISIBLE)
+        free = () if self.evidence is None else self.evidence.seen.free(LIMITS.visible)
         return tuple(replace(motion, point=motion.point + self.dst.origin) for motion in free)
 
     @property

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from teaser_jax import so3
-from teaser_jax.clouds.trust.judge import FEWEST_CELLS, LEAST_FINE_FIT, LEAST_FIT, SURELY, Evidence
+from teaser_jax.clouds.trust.judge import LIMITS, SURELY, Evidence
 
 if TYPE_CHECKING:
     from teaser_jax.clouds.registration import CloudRegistration
@@ -34,13 +34,13 @@ def advice(result: CloudRegistration) -> str:
 
 def _of_cells(result: CloudRegistration, e: Evidence) -> str:
     return (
-        f"{e.cells} cells of {_short(e.voxel_size)} fit, and {FEWEST_CELLS} are needed to tell: give larger "
+        f"{e.cells} cells of {_short(e.voxel_size)} fit, and {LIMITS.cells} are needed to tell: give larger "
         "or denser clouds, or those of a place that both saw."
     )
 
 
 def _of_fit(result: CloudRegistration, e: Evidence) -> str:
-    fit, least = (e.fit, LEAST_FIT) if e.fit < LEAST_FIT else (e.fine_fit, LEAST_FINE_FIT)
+    fit, least = (e.fit, LIMITS.fit) if e.fit < LIMITS.fit else (e.fine_fit, LIMITS.fine_fit)
     return (
         f"No pose was found in which the clouds lie on one another: of the overlap {fit:.0%} fit in the "
         f"best, and {least:.0%} are needed. They may not show one place, or share too little of it, or be in "
@@ -84,6 +84,13 @@ def _of_own(result: CloudRegistration, e: Evidence) -> str:
     )
 
 
+def _of_plain(result: CloudRegistration, e: Evidence) -> str:
+    return (
+        "The clouds fit, and all that fits is a few large planes, as in a corner of a room: another corner "
+        "would fit as well. Give clouds that show what stands there, or that share more."
+    )
+
+
 def _of_tolerance(result: CloudRegistration, e: Evidence) -> str:
     return (
         f"The pose holds, and points of the overlap may be off by {_short(SURELY * e.displacement)}, more "
@@ -116,8 +123,8 @@ def _of_guess(result: CloudRegistration, e: Evidence) -> str:
 
 _OF_DOUBT = {
     "cells": _of_cells, "fit": _of_fit, "space": _of_space, "free": _of_free, "rival": _of_rival,
-    "own": _of_own, "tolerance": _of_tolerance, "part": _of_part, "viewpoint": _of_viewpoint,
-    "guess": _of_guess,
+    "own": _of_own, "plain": _of_plain, "tolerance": _of_tolerance, "part": _of_part,
+    "viewpoint": _of_viewpoint, "guess": _of_guess,
 }  # fmt: skip
 
 

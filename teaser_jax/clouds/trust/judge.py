@@ -19,6 +19,7 @@ from teaser_jax.clouds.pair import Pair
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.observability import Observability, observability
 from teaser_jax.clouds.trust.pairing import lay
+from teaser_jax.clouds.trust.planes import beyond_planes
 from teaser_jax.clouds.trust.rivals import Guess, Rivals, find_rivals
 from teaser_jax.clouds.trust.space import in_front
 from teaser_jax.solution import Status
@@ -27,17 +28,6 @@ CELLS, MOST_CELLS = 6000, 10**9  # of the smaller cloud; a map may have as many 
 FINE_CELLS, MOST_FINE_CELLS = 20_000, 400_000
 FINE_ASKED = 5000  # of the finer cells
 FINER = 0.8  # of the width: another look is worth it only where cells become so much smaller
-# What a pose must reach.
-FEWEST_CELLS = 300
-LEAST_FIT, LEAST_FINE_FIT = 0.20, 0.14
-LEAST_OWN = 0.14
-LEAST_VISIBLE = 0.008
-MOST_IN_FRONT = 0.10
-# What another pose may reach: of the cells that fit, and of the fit.
-MOST_EQUAL, MOST_OF_FIT = 0.80, 0.82
-# Where the pose is so far ahead of all others, it counts whatever they reach: with a cupboard in a box room
-# it is 0.13 ahead, in a corridor one door further on, or on stairs a step, 0.08 at most.
-ENOUGH_LEAD, MOST_AGAINST, GOOD_FIT = 0.10, 0.20, 0.60
 # A pose is off by less than so many expected displacements: bent fragments by two and a half.
 SURELY = 3.0
 
@@ -56,6 +46,7 @@ class Evidence:
         in_front: Which part of either cloud lies in front of what the other sensor saw, the larger one [-];
             NaN: no viewpoint is known.
         residual: How far the surfaces lie apart along their normals [length].
+        beyond_planes: Which share of what fits lies off the five largest planes [-].
         seen: Which motions the normals see.
         rivals: What other poses explain.
     """
@@ -69,6 +60,7 @@ class Evidence:
     support: float
     in_front: float
     residual: float
+    beyond_planes: float
     seen: Observability
     rivals: Rivals
 
@@ -84,8 +76,55 @@ class Evidence:
 
 
 Doubt: TypeAlias = Literal[
-    "matches", "cells", "fit", "space", "free", "rival", "own", "tolerance", "part", "viewpoint", "guess"
+    "matches",
+    "cells",
+    "fit",
+    "space",
+    "free",
+    "rival",
+    "own",
+    "plain",
+    "tolerance",
+    "part",
+    "viewpoint",
+    "guess",
 ]
+
+
+class Limits(NamedTuple):
+    """What a pose must reach, and what another one may: fitted over made-up places (``benchmarks.verdict``).
+
+    Attributes:
+        cells: The least number that fits.
+        fit, fine_fit: The least part of the overlap that fits [-].
+        own: The least part that no other pose explains [-].
+        visible: The least share of any motion that the normals see [-].
+        in_front: What may lie in front of what a sensor saw [-].
+        beyond_planes: What must lie off five planes [-].
+        equal, of_fit: What another pose may reach, of the cells that fit, and of the fit [-].
+        lead: Where the pose is so far ahead of all others, it counts whatever they reach [-],
+        against: if these explain so little alone for what it explains alone [-],
+        good_fit: and if it fits so well [-],
+        whole: and if so much of both clouds lies in the overlap: what sees a room in part may be far ahead
+            in a pose that lays all on the wrong half of it [-].
+    """
+
+    cells: int = 300
+    fit: float = 0.20
+    fine_fit: float = 0.14
+    own: float = 0.14
+    visible: float = 0.008
+    in_front: float = 0.10
+    beyond_planes: float = 0.02
+    equal: float = 0.80
+    of_fit: float = 0.82
+    lead: float = 0.10
+    against: float = 0.20
+    good_fit: float = 0.60
+    whole: float = 0.9
+
+
+LIMITS = Limits()
 
 
 class Verdict(NamedTuple):
@@ -94,9 +133,10 @@ class Verdict(NamedTuple):
     "matches": there is no pose, as no points look alike; "cells": too few of them fit; "fit": too small a
     part of the overlap; "space": too much lies where a sensor looked through; "free": a motion that the
     normals do not see; "rival": another pose explains as much; "own": too little is explained by this pose
-    alone; "tolerance": it holds, and less precisely than asked for; "part": a part is not what was scanned,
-    or not found; "viewpoint": it is, if the camera stood where the scan suggests; "guess": the pose lies
-    further from the initial one than that was said to be off.
+    alone; "plain": all that fits is a few planes, as in any corner of any room; "tolerance": it holds, and
+    less precisely than asked for; "part": a part is not what was scanned, or not found; "viewpoint": it is,
+    if the camera stood where the scan suggests; "guess": the pose lies further from the initial one than
+    that was said to be off.
     """
 
     status: Status
@@ -138,6 +178,7 @@ def judge(
     pose = finer.pose
     with pair.timed("verdict"):
         laid = lay(pose, a, b)
+        fits = laid.here.fits
         seen = observability(laid.here)
         rivals = find_rivals(laid, seen, others, images=pair.images)
     evidence = Evidence(
@@ -150,40 +191,44 @@ def judge(
         support=laid.support,
         in_front=in_front(pose, a, b, pair.images),
         residual=laid.residual,
+        beyond_planes=beyond_planes(laid.here.points[fits], laid.here.normals[fits], b.voxel_size),
         seen=seen,
         rivals=rivals,
     )
     verdict = verdict_of(evidence, tolerance)
-    if guess is not None and evidence.fit >= GOOD_FIT and verdict.doubt in ("rival", "own"):
+    if guess is not None and evidence.fit >= LIMITS.good_fit and verdict.doubt in ("rival", "own", "plain"):
         with pair.timed("verdict"):
             fewer = find_rivals(laid, seen, others, images=pair.images, guess=guess)
         evidence = replace(evidence, rivals=fewer)
-        verdict = verdict_of(evidence, tolerance)
+        verdict = verdict_of(evidence, tolerance, LIMITS._replace(beyond_planes=0.0))
     return Judged(pose, evidence, verdict)
 
 
-def verdict_of(evidence: Evidence, tolerance: float | None = None) -> Verdict:
+def verdict_of(evidence: Evidence, tolerance: float | None = None, limits: Limits = LIMITS) -> Verdict:
     """Give the verdict: OK, or the first question that the evidence fails.
 
     Args:
         evidence: What is known of the pose.
         tolerance: How far points of the overlap may be off [length]; None: two cells.
+        limits: What is asked of it.
     """
-    e = evidence
-    if e.cells < FEWEST_CELLS:
+    e, least, most = evidence, limits, limits
+    if e.cells < least.cells:
         return Verdict(Status.NO_CONSENSUS, "cells")
-    if e.fit < LEAST_FIT or e.fine_fit < LEAST_FINE_FIT:
+    if e.fit < least.fit or e.fine_fit < least.fine_fit:
         return Verdict(Status.NO_CONSENSUS, "fit")
-    if e.in_front > MOST_IN_FRONT:
+    if e.in_front > most.in_front:
         return Verdict(Status.NO_CONSENSUS, "space")
-    if e.seen.visible[0] < LEAST_VISIBLE:
+    if e.seen.visible[0] < least.visible:
         return Verdict(Status.DEGENERATE, "free")
-    ahead = e.rivals.lead.share >= ENOUGH_LEAD and e.rivals.lead.against <= MOST_AGAINST
-    if not (ahead and e.fit >= GOOD_FIT):
-        if e.rivals.equal > MOST_EQUAL or e.rivals.fit > MOST_OF_FIT * e.fit:
+    ahead = e.rivals.lead.share >= least.lead and e.rivals.lead.against <= most.against
+    if not (ahead and e.fit >= least.good_fit and e.overlap >= least.whole):
+        if e.rivals.equal > most.equal or e.rivals.fit > most.of_fit * e.fit:
             return Verdict(Status.AMBIGUOUS, "rival")
-        if e.own < LEAST_OWN:
+        if e.own < least.own:
             return Verdict(Status.NO_CONSENSUS, "own")
+        if e.beyond_planes < least.beyond_planes:
+            return Verdict(Status.AMBIGUOUS, "plain")
     if tolerance is not None and SURELY * e.displacement > tolerance:
         return Verdict(Status.DEGENERATE, "tolerance")
     return Verdict(Status.OK, None)
