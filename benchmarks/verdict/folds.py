@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ def value(rows: Sequence[Row], limits: Limits, price: float) -> float:
 
 
 def fitted(rows: Sequence[Row], price: float = 20.0, start: Limits = LIMITS) -> Limits:
-    """Choose limits one after the other, until none does better; of equal ones the strictest is kept.
+    """Choose limits one after the other, until none does better; where it makes no difference, none is moved.
 
     Args:
         rows: Pairs.
@@ -67,11 +67,8 @@ def fitted(rows: Sequence[Row], price: float = 20.0, start: Limits = LIMITS) -> 
     for _ in range(ROUNDS):
         before = best
         for name, choices in CHOICES.items():
-            strictness: Callable[[float], float] = lambda x, n=name: (
-                -x if n in ("equal", "of_fit", "against") else x
-            )
-            tried = [best._replace(**{name: x}) for x in choices]
-            best = max(tried, key=lambda t, n=name: (value(rows, t, price), strictness(getattr(t, n))))
+            tried = [best, *(best._replace(**{name: x}) for x in choices)]
+            best = max(tried, key=lambda limits: value(rows, limits, price))  # the first of equal ones
         if best == before:
             break
     return best

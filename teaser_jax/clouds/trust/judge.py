@@ -112,7 +112,7 @@ class Limits(NamedTuple):
     cells: int = 300
     fit: float = 0.20
     fine_fit: float = 0.14
-    own: float = 0.14
+    own: float = 0.18
     visible: float = 0.008
     in_front: float = 0.10
     beyond_planes: float = 0.02
