@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("small_gicp", reason="needs the extra clouds")
 
+import teaser_jax as tj
 from teaser_jax.clouds.fine import align
 from teaser_jax.clouds.surface import Surface
 from teaser_jax.clouds.trust.lead import Lead, lead
 from teaser_jax.clouds.trust.observability import observability
 from teaser_jax.clouds.trust.pairing import direction_weights, lay, pair
+from teaser_jax.clouds.trust.planes import beyond_planes
 from teaser_jax.clouds.voxel import downsample
 
 STILL = np.eye(4)
@@ -158,3 +160,24 @@ def test_cells_that_leave_the_other_cloud_say_nothing():
 
 def test_the_worse_of_two_leads_takes_the_worse_of_both():
     assert Lead(0.3, 0.2).at_worst(Lead(0.1, 0.05)) == Lead(0.1, 0.2)
+
+
+def test_what_lies_off_five_planes_tells_furniture_from_walls():
+    shares = []
+    for faces in (ROOM[:5], [*ROOM[:5], *CUPBOARD]):
+        one = surface(on_faces(0, 60_000, faces), 0.08)
+        held = one.normals.any(axis=1)
+        shares.append(beyond_planes(one.points[held], one.normals[held], 0.08))
+    assert shares[0] < 0.01
+    assert shares[1] > 0.03
+    hills = surface(terrain(0, 40_000), 0.3)
+    assert beyond_planes(hills.points, hills.normals, 0.3) > 0.3
+    assert beyond_planes(np.zeros((0, 3)), np.zeros((0, 3)), 1.0) == 0
+
+
+def test_one_corner_of_an_empty_room_on_another_is_not_ok():
+    room = on_faces(0, 120_000, ROOM)
+    here, there = room[(room[:, 0] < 1) & (room[:, 1] < 0.8)], room[(room[:, 0] > -1.2) & (room[:, 1] > -1)]
+    found = tj.register_clouds(here, there)
+    assert not found.ok
+    assert found.status in (tj.Status.AMBIGUOUS, tj.Status.DEGENERATE)

@@ -1,6 +1,6 @@
 """Fit the verdict on raw clouds by folds over made-up places.
 
-``python -m benchmarks.verdict --places 8 -o pairs.jsonl``: whatever ends it, the same command goes on where it was.
+``python -m benchmarks.verdict --places 8 -o pairs.jsonl``; whatever ends it, the same command goes on.
 """
 
 from __future__ import annotations

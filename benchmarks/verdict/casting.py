@@ -48,7 +48,7 @@ def lidar(rings: int = 48, steps: int = 720, low: float = -24.0, high: float = 1
 
 
 def camera(heading: float, tilt: float, width: int = 220, height: int = 165) -> np.ndarray:
-    """Directions of a depth camera with a field of 100 by 84 degrees, level but for a tilt [rad]."""
+    """Directions of a depth camera with a field of 100 by 84 degrees, level but for a tilt upwards [rad]."""
     across, up = np.meshgrid(np.linspace(1.2, -1.2, width), np.linspace(0.9, -0.9, height))
     rays = np.stack([np.ones_like(across), across, up], axis=-1).reshape(-1, 3)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -14,6 +14,8 @@ from teaser_jax.clouds.trust.rivals import Rivals
 from teaser_jax.solution import Status
 
 FOLDS = 7
+# Where folds begin: limits that nobody has chosen on these places.
+LOOSE = Limits(fit=0.15, fine_fit=0.10, own=0.10, visible=0.004, beyond_planes=0.0, whole=0.0)
 ROUNDS = 3
 # What each limit is chosen from. Cells and free space are not: too few pairs come near theirs.
 CHOICES: dict[str, Sequence[float]] = {
@@ -55,7 +57,7 @@ def value(rows: Sequence[Row], limits: Limits, price: float) -> float:
     return right - price * (len(ok) - right)
 
 
-def fitted(rows: Sequence[Row], price: float = 20.0, start: Limits = LIMITS) -> Limits:
+def fitted(rows: Sequence[Row], price: float = 20.0, start: Limits = LOOSE) -> Limits:
     """Choose limits one after the other, until none does better; where it makes no difference, none is moved.
 
     Args:

@@ -26,12 +26,16 @@ class Part(NamedTuple):
 
 
 def random_solid(
-    seed: Seed, *, kinds: Sequence[Kind] = KINDS, parts: int | tuple[int, int] = (7, 10), n: int = 20_000
+    seed: Seed | np.random.Generator,
+    *,
+    kinds: Sequence[Kind] = KINDS,
+    parts: int | tuple[int, int] = (7, 10),
+    n: int = 20_000,
 ) -> Points:
     """Draw points on a union of solids of random sizes, places and directions, uniform on its surface.
 
     Args:
-        seed: Anything ``numpy.random.default_rng`` takes.
+        seed: A seed, or a generator to draw from.
         kinds: The kinds of parts to draw from: a family of shapes.
         parts: Their number, or the range (low, high) from which it is drawn.
         n: Number of points.
