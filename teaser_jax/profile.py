@@ -107,7 +107,7 @@ class Stopwatch:
             output = jax.block_until_ready(run(*inputs, **choices))
             seconds = time.perf_counter() - start
             if repeat == 0:
-                self.cold[name] = seconds
+                self.cold[name] = self.cold.get(name, 0.0) + seconds
             else:
                 self.warm.setdefault(name, []).append(seconds)
         return output

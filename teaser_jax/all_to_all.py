@@ -1,0 +1,291 @@
+"""The door for points without matches: every point of one cloud may be any point of the other.
+
+Of n m matches all but a few are wrong, and the clique finds them all the same (section XI-C). Matches that
+share a point exclude each other, so no clique has more matches than the smaller cloud has points: a clique of
+all of them is proved at once. Clouds that fit in several poses, as those of symmetric things do, are told by
+further cliques, of matches that are none under the answers before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from teaser_jax.agreement import Graph, prepare
+from teaser_jax.engine.frames import centred_one, with_origins, without_padding
+from teaser_jax.engine.packing import pack_problem, unpack_problem
+from teaser_jax.engine.sizes import size_of
+from teaser_jax.ground import bits
+from teaser_jax.ground.arrays import inside_jit, is_traced
+from teaser_jax.ground.flags import as_on_the_host
+from teaser_jax.pose import Pose
+from teaser_jax.problem import Problem, clean, host_problem
+from teaser_jax.profile import Stopwatch
+from teaser_jax.reading import point_rows, positive_number
+from teaser_jax.register import INSIDE_JIT, Registration
+from teaser_jax.settings import Settings, check_settings
+from teaser_jax.solution import Solution, Status
+from teaser_jax.solve import conclude, find_inliers
+from teaser_jax.stages.assignment import least_cost_pairs
+from teaser_jax.stages.clique.clique import Clique
+from teaser_jax.stages.clique.exact import ExactClique
+from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
+from teaser_jax.stages.consistency import consistency_graph
+from teaser_jax.stages.one_to_one import OneToOne
+from teaser_jax.stages.refinement import Refinement, fit_similarity, squared_residuals
+from teaser_jax.summary import summary
+
+MOST_MATCHES = 1 << 16  # their graph takes half a gigabyte, and its search twice as much
+ANSWERS = 3  # a mirror image, the answer, and its rival
+NEAR = 3.0  # bounds: matches that lie nearer under an answer are its matches, too
+# A rival's clique has more than so large a share of the first one, beside it.
+SHARE_BESIDE = 0.5
+# A rival that explains so large a share of the pairs could be the answer: which one explains a few more is
+# a matter of which points both clouds happen to hold.
+SHARE_OF_RIVAL = 0.8
+SETTINGS = Settings(clique=ExactClique(seconds=20.0))
+
+
+class Rival(NamedTuple):
+    """Another answer.
+
+    Attributes:
+        pose: ``T_dst_src``.
+        explained: Pairs that it explains, each point once.
+    """
+
+    pose: Pose
+    explained: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AllToAll(Registration):
+    """The answer of ``all_to_all``: that of ``register`` to all matches, and which point is which.
+
+    Matches are all pairs of a source point and a target point that can be used, the source first. Inliers
+    have each point once.
+
+    Attributes:
+        pairs: Rows (i, j): source point i is target point j, in the order of the source.
+        rivals: Other poses that were found, and how many pairs each explains.
+        rival_bound: No more pairs agree with one another beside those of the poses found: proved.
+        seconds: What the work took, by stage; compiling counts [s].
+    """
+
+    pairs: Int[np.ndarray, "k 2"]
+    rivals: tuple[Rival, ...]
+    rival_bound: int
+    seconds: dict[str, float]
+
+    @property
+    def T_dst_src(self) -> Float[np.ndarray, "4 4"]:
+        """The pose as a matrix."""
+        return np.asarray(self.pose.matrix, np.float64)
+
+    def __repr__(self) -> str:
+        first, *rest = summary(self).split("\n")
+        rivals = ", ".join(f"{x.explained} pairs" for x in self.rivals) or "none found"
+        return "\n".join([first, f"  rivals       {rivals}; at most {self.rival_bound} others agree", *rest])
+
+
+def all_to_all(
+    src: Any, dst: Any, *, noise_bound: Any, scale: Any = 1.0, settings: Settings = SETTINGS
+) -> AllToAll:
+    """Register two clouds of few points without matches and without descriptors: all pairs are tried.
+
+    Both clouds have to hold the same points, at least in part: corners, holes, centres of things, points that
+    were thinned before one of them was moved. Points that two sensors drew from one surface are not the same:
+    ``register_clouds`` is for those. Time and memory grow with the square of n m: a hundred points a side
+    take a second, two hundred half a minute. Points that are not finite are left out, and of equal ones all
+    but one.
+
+    ``ok`` wants what it wants of ``register``, and that no other pose explains four fifths as many points:
+    otherwise the status is ``AMBIGUOUS``.
+
+    Args:
+        src, dst: (n, 3) and (m, 3) points, in any order; as for ``register``.
+        noise_bound: Largest error of a right pair, one number [unit of dst].
+        scale: Known scale [-].
+        settings: How to solve; the clique may be searched for 20 s, and half as long for each rival.
+
+    Returns:
+        An ``AllToAll``, which is a ``Registration``; act upon it only where ``ok``.
+
+    Raises:
+        ValueError: Bad input, more than 65 536 matches, or settings without a clique; also when called under
+            jit.
+
+    References: section XI-C, Fig. 7.
+    """
+    check_settings(settings)
+    if is_traced(src, dst, noise_bound, scale, settings) or inside_jit():
+        raise ValueError(INSIDE_JIT.format("all_to_all"))
+    if not settings.clique.prunes:
+        raise ValueError("all_to_all is nothing without a clique: give settings with another one than 'none'.")
+    if scale is None:
+        raise ValueError("all_to_all needs a known scale: wrong matches outvote any other.")
+    (a, i), (b, j) = (_usable(x, name) for x, name in ((src, "src"), (dst, "dst")))
+    n, m = len(i), len(j)
+    if n * m > MOST_MATCHES:
+        raise ValueError(
+            f"{n} and {m} points make {n * m} matches: expected {MOST_MATCHES} at most. Give fewer points, or "
+            "use register_clouds."
+        )
+    source, target = np.divmod(np.arange(n * m), m)
+    bound = positive_number(noise_bound, "noise_bound")
+    problem = host_problem(a[source], b[target], noise_bound=bound, scale=scale)
+    found = _find(problem, (n, m), settings)
+    best = max(found.solutions, key=lambda x: int(x.inliers.sum()))
+    rivals = tuple(Rival(x.pose, int(x.inliers.sum())) for x in found.solutions if x is not best)
+    most = max((x.explained for x in rivals), default=0)
+    if best.status == Status.OK and most >= SHARE_OF_RIVAL * best.inliers.sum():
+        best = replace(best, status=np.int32(Status.AMBIGUOUS))
+    one = Registration.of(problem, best)
+    rows = np.flatnonzero(one.inliers)
+    pairs = np.stack([i[source[rows]], j[target[rows]]], axis=1)
+    known = one.pose, one.inliers, one.status, one.solution, one.problem
+    return AllToAll(*known, pairs, rivals, found.bound, found.seconds)
+
+
+def _usable(points: Any, name: str) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+    """Read points, and find those that can be used: finite, and of equal ones the first."""
+    points = np.asarray(point_rows(points, name))
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    if not len(finite):
+        raise ValueError(f"{name} has no finite point.")
+    rows = finite[np.sort(np.unique(points[finite], axis=0, return_index=True)[1])]
+    return points[rows], rows
+
+
+class _Found(NamedTuple):
+    """The answers, in the order in which they were found; the bound on the next one; seconds by stage."""
+
+    solutions: list[Solution]
+    bound: int
+    seconds: dict[str, float]
+
+
+def _find(problem: Problem, shape: tuple[int, int], settings: Settings) -> _Found:
+    """Find an answer to all matches of two clouds of so many points, and others beside it."""
+    on_host = {"centre", "clique, host", "rivals", "refinement"}
+    on_host |= {"rotation"} if settings.rotation.needs_host else set()
+    timed = Stopwatch(0, frozenset(on_host))
+    near = timed("centre", centred_one, pack_problem(problem, settings, size_of(problem)))
+    with as_on_the_host():
+        p, excluded = timed("clean", clean, unpack_problem(near.sent))
+        graph = prepare(p, settings, edge_dtype=near.edge_dtype, edges=_apart, run=timed)
+        order = np.asarray(graph.rows.order)
+        refinement = partial(_refined, order=order, shape=shape)
+        first = clique = _first(graph, settings, min(shape), timed)
+        least = int(SHARE_BESIDE * first.members.sum())
+        free, bound, found = np.asarray(graph.mask), min(shape), []
+        while clique is not None:
+            solution = conclude(
+                p, excluded, graph, Clique(clique.members, first.upper_bound), settings,
+                offset=near.sent.offset, refinement=refinement, run=timed,
+            )  # fmt: skip
+            found.append(jax.device_get(solution))
+            if len(found) == ANSWERS or found[-1].status not in (Status.OK, Status.MIRRORED):
+                break
+            r2 = np.asarray(squared_residuals(solution.pose, p.src, p.dst, p.noise_bound))
+            free = free & ~clique.members & (r2[order] > NEAR**2)
+            clique, bound = timed("rivals", _beside, graph, first, free, least, settings)
+    return _Found([_given(x, problem, near.origins) for x in found], bound, timed.cold)
+
+
+def _apart(p: Problem, scale: Float[Array, ""]) -> OneToOne:
+    """Find who agrees with whom at a scale: matches of one point do not."""
+    edges = consistency_graph(
+        p.src, p.dst, p.noise_bound, p.mask, scale=scale, cbar2=p.cbar2, one_to_one=True
+    )  # fmt: skip
+    return OneToOne(edges, jnp.zeros(p.mask.shape, jnp.float32))
+
+
+def _first(graph: Graph, settings: Settings, most: int, timed: Stopwatch) -> Clique:
+    """Find the largest clique; it has each point once, so that no clique has more than ``most`` matches.
+
+    A method that searches on the host does so at once: what the device would do before proves nothing here.
+    """
+    method, nothing = settings.clique, Clique(np.zeros(graph.mask.shape, bool), np.int32(most))
+    if method.needs_host:
+        return timed("clique, host", finish_on_host, method, graph.edge_bits, graph.mask, nothing)
+    found = timed("clique, device", search_on_device, method, graph.edge_bits, graph.mask)
+    return Clique(np.asarray(found.members), np.minimum(found.upper_bound, np.int32(most)))
+
+
+def _beside(
+    graph: Graph, first: Clique, free: Bool[np.ndarray, " n"], least: int, settings: Settings
+) -> tuple[Clique | None, int]:
+    """Find the largest clique among the free matches, if it has more than ``least``, and a bound on it.
+
+    So many members of the first clique are put beside the free matches, joined with none of them: a search
+    that begins with these looks for nothing smaller.
+    """
+    start = np.zeros_like(free)
+    start[np.flatnonzero(first.members)[:least]] = True
+    edges, mask = _among(np.asarray(graph.edge_bits), free, start), free | start
+    method = settings.clique
+    if isinstance(method, ExactClique):
+        method = replace(method, seconds=method.seconds / 2)
+    if method.needs_host:
+        found = finish_on_host(method, edges, mask, Clique(start, np.int32(first.upper_bound)))
+    else:
+        found = jax.device_get(jax.jit(search_on_device)(method, edges, mask))
+    is_larger = bool((found.members & free).sum() > least)
+    return (found if is_larger else None), int(min(found.upper_bound, first.upper_bound))
+
+
+def _among(
+    edge_bits: UInt32[np.ndarray, "n w"], free: Bool[np.ndarray, " n"], start: Bool[np.ndarray, " n"]
+) -> UInt32[np.ndarray, "n w"]:
+    """Leave the edges within each of two sets of matches."""
+    left = np.zeros_like(edge_bits)
+    for chosen in (free, start):
+        np.bitwise_and(edge_bits, np.asarray(bits.pack(chosen)), out=left, where=chosen[:, None])
+    return left
+
+
+_find_inliers = jax.jit(find_inliers)
+
+
+@jax.jit
+def _residuals(p: Problem, inliers: Bool[Array, " n"]) -> Float[Array, " n"]:
+    """Fit the pose to inliers, and compute the squared residuals of all matches."""
+    weights = jnp.where(inliers, p.confidence / p.noise_bound**2, 0)
+    pose = fit_similarity(p.src, p.dst, weights, p.scale).pose
+    return squared_residuals(pose, p.src, p.dst, p.noise_bound)
+
+
+def _refined(
+    p: Problem, start: Pose, refinement: Refinement, *, order: Int[np.ndarray, " n"], shape: tuple[int, int]
+) -> tuple[Bool[np.ndarray, " n"], bool]:
+    """Find the inliers where the joint cost (6) of pairs stops falling that have each point once.
+
+    Pairs are chosen for a pose, and a pose is fitted to pairs, in turns; each lowers the cost. Rows are
+    those of the method; ``order`` tells the match of each.
+    """
+    inliers, settled = _find_inliers(p, start, refinement)
+    rows = np.flatnonzero(np.asarray(p.mask))
+    place = np.full(shape, -1)
+    place.ravel()[order[rows]] = rows
+    for _ in range(refinement.iterations):
+        r2 = np.asarray(_residuals(p, inliers))
+        table = np.where(place >= 0, r2[place], np.inf)
+        pairs = least_cost_pairs(table, float(p.cbar2))
+        chosen = np.zeros(len(r2), bool)
+        chosen[place[pairs[:, 0], pairs[:, 1]]] = True
+        if np.array_equal(chosen, inliers):
+            return chosen, bool(settled)
+        inliers = chosen
+    return np.asarray(inliers), False
+
+
+def _given(solution: Solution, problem: Problem, origins: Any) -> Solution:
+    """Carry a solution back to the rows and the frames as given."""
+    return with_origins(without_padding(solution, problem), origins)
