@@ -2,8 +2,7 @@
 
 Of n m matches all but a few are wrong, and the clique finds them all the same (section XI-C). Matches that
 share a point exclude each other, so no clique has more matches than the smaller cloud has points: a clique of
-all of them is proved at once. Clouds that fit in several poses, as those of symmetric things do, are told by
-further cliques, of matches that are none under the answers before.
+all of them is proved at once. Things that are symmetric fit in several poses: these are looked for, too.
 """
 
 from __future__ import annotations
@@ -15,20 +14,21 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
 from teaser_jax.agreement import Graph, prepare
 from teaser_jax.engine.frames import centred_one, with_origins, without_padding
 from teaser_jax.engine.packing import pack_problem, unpack_problem
 from teaser_jax.engine.sizes import size_of
-from teaser_jax.ground import bits
 from teaser_jax.ground.arrays import inside_jit, is_traced
 from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose
 from teaser_jax.problem import Problem, clean, host_problem
 from teaser_jax.profile import Stopwatch
 from teaser_jax.reading import point_rows, positive_number
+from teaser_jax.refit import widened
 from teaser_jax.register import INSIDE_JIT, Registration
+from teaser_jax.rows import in_rows
 from teaser_jax.settings import Settings, check_settings
 from teaser_jax.solution import Solution, Status
 from teaser_jax.solve import conclude, find_inliers
@@ -39,13 +39,11 @@ from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
 from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.one_to_one import OneToOne
 from teaser_jax.stages.refinement import Refinement, fit_similarity, squared_residuals
+from teaser_jax.stages.rivals.congruent import other_poses
 from teaser_jax.summary import summary
 
 MOST_MATCHES = 1 << 16  # their graph takes half a gigabyte, and its search twice as much
-ANSWERS = 3  # a mirror image, the answer, and its rival
-NEAR = 3.0  # bounds: matches that lie nearer under an answer are its matches, too
-# A rival's clique has more than so large a share of the first one, beside it.
-SHARE_BESIDE = 0.5
+OTHERS = 2  # other poses that are looked at: the first clique may be mirrored, and then one is the answer
 # A rival that explains so large a share of the pairs could be the answer: which one explains a few more is
 # a matter of which points both clouds happen to hold.
 SHARE_OF_RIVAL = 0.8
@@ -74,13 +72,11 @@ class AllToAll(Registration):
     Attributes:
         pairs: Rows (i, j): source point i is target point j, in the order of the source.
         rivals: Other poses that were found, and how many pairs each explains.
-        rival_bound: No more pairs agree with one another beside those of the poses found: proved.
         seconds: What the work took, by stage; compiling counts [s].
     """
 
     pairs: Int[np.ndarray, "k 2"]
     rivals: tuple[Rival, ...]
-    rival_bound: int
     seconds: dict[str, float]
 
     @property
@@ -91,7 +87,7 @@ class AllToAll(Registration):
     def __repr__(self) -> str:
         first, *rest = summary(self).split("\n")
         rivals = ", ".join(f"{x.explained} pairs" for x in self.rivals) or "none found"
-        return "\n".join([first, f"  rivals       {rivals}; at most {self.rival_bound} others agree", *rest])
+        return "\n".join([first, f"  rivals       {rivals}", *rest])
 
 
 def all_to_all(
@@ -112,7 +108,7 @@ def all_to_all(
         src, dst: (n, 3) and (m, 3) points, in any order; as for ``register``.
         noise_bound: Largest error of a right pair, one number [unit of dst].
         scale: Known scale [-].
-        settings: How to solve; the clique may be searched for 20 s, and half as long for each rival.
+        settings: How to solve; the clique is searched for 20 s at most.
 
     Returns:
         An ``AllToAll``, which is a ``Registration``; act upon it only where ``ok``.
@@ -127,15 +123,17 @@ def all_to_all(
     if is_traced(src, dst, noise_bound, scale, settings) or inside_jit():
         raise ValueError(INSIDE_JIT.format("all_to_all"))
     if not settings.clique.prunes:
-        raise ValueError("all_to_all is nothing without a clique: give settings with another one than 'none'.")
+        raise ValueError(
+            "all_to_all is nothing without a clique: give settings with another one than 'none'."
+        )
     if scale is None:
         raise ValueError("all_to_all needs a known scale: wrong matches outvote any other.")
     (a, i), (b, j) = (_usable(x, name) for x, name in ((src, "src"), (dst, "dst")))
     n, m = len(i), len(j)
     if n * m > MOST_MATCHES:
         raise ValueError(
-            f"{n} and {m} points make {n * m} matches: expected {MOST_MATCHES} at most. Give fewer points, or "
-            "use register_clouds."
+            f"{n} and {m} points make {n * m} matches: expected {MOST_MATCHES} at most. Give fewer points, "
+            "or use register_clouds."
         )
     source, target = np.divmod(np.arange(n * m), m)
     bound = positive_number(noise_bound, "noise_bound")
@@ -150,7 +148,7 @@ def all_to_all(
     rows = np.flatnonzero(one.inliers)
     pairs = np.stack([i[source[rows]], j[target[rows]]], axis=1)
     known = one.pose, one.inliers, one.status, one.solution, one.problem
-    return AllToAll(*known, pairs, rivals, found.bound, found.seconds)
+    return AllToAll(*known, pairs, rivals, found.seconds)
 
 
 def _usable(points: Any, name: str) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
@@ -164,10 +162,9 @@ def _usable(points: Any, name: str) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
 
 
 class _Found(NamedTuple):
-    """The answers, in the order in which they were found; the bound on the next one; seconds by stage."""
+    """The answers, and what they took by stage."""
 
     solutions: list[Solution]
-    bound: int
     seconds: dict[str, float]
 
 
@@ -182,21 +179,31 @@ def _find(problem: Problem, shape: tuple[int, int], settings: Settings) -> _Foun
         graph = prepare(p, settings, edge_dtype=near.edge_dtype, edges=_apart, run=timed)
         order = np.asarray(graph.rows.order)
         refinement = partial(_refined, order=order, shape=shape)
-        first = clique = _first(graph, settings, min(shape), timed)
-        least = int(SHARE_BESIDE * first.members.sum())
-        free, bound, found = np.asarray(graph.mask), min(shape), []
-        while clique is not None:
-            solution = conclude(
-                p, excluded, graph, Clique(clique.members, first.upper_bound), settings,
-                offset=near.sent.offset, refinement=refinement, run=timed,
-            )  # fmt: skip
-            found.append(jax.device_get(solution))
-            if len(found) == ANSWERS or found[-1].status not in (Status.OK, Status.MIRRORED):
-                break
-            r2 = np.asarray(squared_residuals(solution.pose, p.src, p.dst, p.noise_bound))
-            free = free & ~clique.members & (r2[order] > NEAR**2)
-            clique, bound = timed("rivals", _beside, graph, first, free, least, settings)
-    return _Found([_given(x, problem, near.origins) for x in found], bound, timed.cold)
+        clique = _largest(graph, settings, min(shape), timed)
+        answer = partial(
+            conclude, p, excluded, graph,
+            settings=settings, offset=near.sent.offset, refinement=refinement, run=timed,
+        )  # fmt: skip
+        found = [jax.device_get(answer(clique))]
+        if found[0].status in (Status.OK, Status.MIRRORED):
+            near_rows = widened(in_rows(p, graph.rows), graph.widening)
+            for pose in timed("rivals", _others, p, graph, clique, order, shape):
+                members, _ = refinement(near_rows, pose, Refinement())
+                found.append(jax.device_get(answer(Clique(members, clique.upper_bound))))
+    return _Found([_given(x, problem, near.origins) for x in found], timed.cold)
+
+
+def _others(
+    p: Problem, graph: Graph, clique: Clique, order: Int[np.ndarray, " n"], shape: tuple[int, int]
+) -> list[Pose]:
+    """Find poses beside the one of a clique that explain much of what it does, or of which it is a mirror."""
+    src, dst = (np.asarray(x) for x in (p.src, p.dst))
+    n, m = shape
+    a, b = float(p.scale) * src[: n * m : m], dst[:m]
+    source, target = np.divmod(np.sort(order[np.flatnonzero(clique.members)]), m)
+    bound = float(jnp.sqrt(p.cbar2) * graph.widening * p.noise_bound[0])
+    others = other_poses(a, b, np.stack([source, target], axis=1), noise_bound=bound)
+    return [replace(x.pose, scale=p.scale) for x in others[:OTHERS]]
 
 
 def _apart(p: Problem, scale: Float[Array, ""]) -> OneToOne:
@@ -207,7 +214,7 @@ def _apart(p: Problem, scale: Float[Array, ""]) -> OneToOne:
     return OneToOne(edges, jnp.zeros(p.mask.shape, jnp.float32))
 
 
-def _first(graph: Graph, settings: Settings, most: int, timed: Stopwatch) -> Clique:
+def _largest(graph: Graph, settings: Settings, most: int, timed: Stopwatch) -> Clique:
     """Find the largest clique; it has each point once, so that no clique has more than ``most`` matches.
 
     A method that searches on the host does so at once: what the device would do before proves nothing here.
@@ -217,38 +224,6 @@ def _first(graph: Graph, settings: Settings, most: int, timed: Stopwatch) -> Cli
         return timed("clique, host", finish_on_host, method, graph.edge_bits, graph.mask, nothing)
     found = timed("clique, device", search_on_device, method, graph.edge_bits, graph.mask)
     return Clique(np.asarray(found.members), np.minimum(found.upper_bound, np.int32(most)))
-
-
-def _beside(
-    graph: Graph, first: Clique, free: Bool[np.ndarray, " n"], least: int, settings: Settings
-) -> tuple[Clique | None, int]:
-    """Find the largest clique among the free matches, if it has more than ``least``, and a bound on it.
-
-    So many members of the first clique are put beside the free matches, joined with none of them: a search
-    that begins with these looks for nothing smaller.
-    """
-    start = np.zeros_like(free)
-    start[np.flatnonzero(first.members)[:least]] = True
-    edges, mask = _among(np.asarray(graph.edge_bits), free, start), free | start
-    method = settings.clique
-    if isinstance(method, ExactClique):
-        method = replace(method, seconds=method.seconds / 2)
-    if method.needs_host:
-        found = finish_on_host(method, edges, mask, Clique(start, np.int32(first.upper_bound)))
-    else:
-        found = jax.device_get(jax.jit(search_on_device)(method, edges, mask))
-    is_larger = bool((found.members & free).sum() > least)
-    return (found if is_larger else None), int(min(found.upper_bound, first.upper_bound))
-
-
-def _among(
-    edge_bits: UInt32[np.ndarray, "n w"], free: Bool[np.ndarray, " n"], start: Bool[np.ndarray, " n"]
-) -> UInt32[np.ndarray, "n w"]:
-    """Leave the edges within each of two sets of matches."""
-    left = np.zeros_like(edge_bits)
-    for chosen in (free, start):
-        np.bitwise_and(edge_bits, np.asarray(bits.pack(chosen)), out=left, where=chosen[:, None])
-    return left
 
 
 _find_inliers = jax.jit(find_inliers)
