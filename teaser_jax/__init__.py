@@ -55,10 +55,10 @@ _MODULES = ("files", "learn", "metrics", "plots", "settings", "so3", "studies", 
 
 __all__ = [
     "AllToAll", "Certificate", "CloudRegistration", "Pose", "Problem", "Registration", "Selection",
-    "Settings", "Solution", "Status", "all_to_all", "certify", "certify_rotation", "covariance", "error_bounds", "files",
-    "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare", "profile", "refit",
-    "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve", "solve_batch",
-    "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
+    "Settings", "Solution", "Status", "all_to_all", "certify", "certify_rotation", "covariance",
+    "error_bounds", "files", "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare",
+    "profile", "refit", "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve",
+    "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
 ]  # fmt: skip
 
 

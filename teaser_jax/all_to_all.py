@@ -39,7 +39,7 @@ from teaser_jax.stages.clique.maximum import finish_on_host, search_on_device
 from teaser_jax.stages.consistency import consistency_graph
 from teaser_jax.stages.one_to_one import OneToOne
 from teaser_jax.stages.refinement import Refinement, fit_similarity, squared_residuals
-from teaser_jax.stages.rivals.congruent import other_poses
+from teaser_jax.stages.rivals.congruent import is_same, other_poses
 from teaser_jax.summary import summary
 
 MOST_MATCHES = 1 << 16  # their graph takes half a gigabyte, and its search twice as much
@@ -138,17 +138,36 @@ def all_to_all(
     source, target = np.divmod(np.arange(n * m), m)
     bound = positive_number(noise_bound, "noise_bound")
     problem = host_problem(a[source], b[target], noise_bound=bound, scale=scale)
-    found = _find(problem, (n, m), settings)
-    best = max(found.solutions, key=lambda x: int(x.inliers.sum()))
-    rivals = tuple(Rival(x.pose, int(x.inliers.sum())) for x in found.solutions if x is not best)
-    most = max((x.explained for x in rivals), default=0)
-    if best.status == Status.OK and most >= SHARE_OF_RIVAL * best.inliers.sum():
+    solutions, seconds = _find(problem, (n, m), settings)
+    best = max(solutions, key=lambda x: (int(x.inliers.sum()), x.status == Status.OK))
+    rows = np.flatnonzero(best.inliers)
+    rivals = tuple(_rivals(best, solutions, problem.src[rows], float(bound)))
+    if best.status == Status.OK and any(x.explained >= SHARE_OF_RIVAL * len(rows) for x in rivals):
         best = replace(best, status=np.int32(Status.AMBIGUOUS))
     one = Registration.of(problem, best)
-    rows = np.flatnonzero(one.inliers)
     pairs = np.stack([i[source[rows]], j[target[rows]]], axis=1)
-    known = one.pose, one.inliers, one.status, one.solution, one.problem
-    return AllToAll(*known, pairs, rivals, found.seconds)
+    return AllToAll(
+        one.pose,
+        one.inliers,
+        one.status,
+        one.solution,
+        one.problem,
+        pairs=pairs,
+        rivals=rivals,
+        seconds=seconds,
+    )
+
+
+def _rivals(
+    best: Solution, solutions: list[Solution], points: Float[np.ndarray, "k 3"], bound: float
+) -> list[Rival]:
+    """List the solutions that bring the points of the best one elsewhere."""
+    there = best.pose.apply(points)
+    return [
+        Rival(x.pose, int(x.inliers.sum()))
+        for x in solutions
+        if x.inliers.any() and not is_same(x.pose.apply(points), there, bound)
+    ]
 
 
 def _usable(points: Any, name: str) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
@@ -161,15 +180,10 @@ def _usable(points: Any, name: str) -> tuple[Float[np.ndarray, "n 3"], Int[np.nd
     return points[rows], rows
 
 
-class _Found(NamedTuple):
-    """The answers, and what they took by stage."""
-
-    solutions: list[Solution]
-    seconds: dict[str, float]
-
-
-def _find(problem: Problem, shape: tuple[int, int], settings: Settings) -> _Found:
-    """Find an answer to all matches of two clouds of so many points, and others beside it."""
+def _find(
+    problem: Problem, shape: tuple[int, int], settings: Settings
+) -> tuple[list[Solution], dict[str, float]]:
+    """Find the answers to all matches of two clouds of so many points, and what each stage took [s]."""
     on_host = {"centre", "clique, host", "rivals", "refinement"}
     on_host |= {"rotation"} if settings.rotation.needs_host else set()
     timed = Stopwatch(0, frozenset(on_host))
@@ -190,7 +204,7 @@ def _find(problem: Problem, shape: tuple[int, int], settings: Settings) -> _Foun
             for pose in timed("rivals", _others, p, graph, clique, order, shape):
                 members, _ = refinement(near_rows, pose, Refinement())
                 found.append(jax.device_get(answer(Clique(members, clique.upper_bound))))
-    return _Found([_given(x, problem, near.origins) for x in found], timed.cold)
+    return [with_origins(without_padding(x, problem), near.origins) for x in found], timed.cold
 
 
 def _others(
@@ -199,11 +213,12 @@ def _others(
     """Find poses beside the one of a clique that explain much of what it does, or of which it is a mirror."""
     src, dst = (np.asarray(x) for x in (p.src, p.dst))
     n, m = shape
-    a, b = float(p.scale) * src[: n * m : m], dst[:m]
+    scale = jnp.asarray(p.scale)
+    a, b = float(scale) * src[: n * m : m], dst[:m]
     source, target = np.divmod(np.sort(order[np.flatnonzero(clique.members)]), m)
     bound = float(jnp.sqrt(p.cbar2) * graph.widening * p.noise_bound[0])
     others = other_poses(a, b, np.stack([source, target], axis=1), noise_bound=bound)
-    return [replace(x.pose, scale=p.scale) for x in others[:OTHERS]]
+    return [replace(x.pose, scale=scale) for x in others[:OTHERS]]
 
 
 def _apart(p: Problem, scale: Float[Array, ""]) -> OneToOne:
@@ -259,8 +274,3 @@ def _refined(
             return chosen, bool(settled)
         inliers = chosen
     return np.asarray(inliers), False
-
-
-def _given(solution: Solution, problem: Problem, origins: Any) -> Solution:
-    """Carry a solution back to the rows and the frames as given."""
-    return with_origins(without_padding(solution, problem), origins)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from teaser_jax.pose import Pose
@@ -67,6 +67,13 @@ def other_poses(
     return _distinct(sorted(found, key=lambda x: -x.explained), here, there, noise_bound)
 
 
+def is_same(
+    one: Float[np.ndarray, "*c k 3"], other: Float[np.ndarray, "k 3"], bound: float
+) -> Bool[np.ndarray, "*c"] | np.bool_:
+    """Tell whether two poses are one, by where they bring the same points."""
+    return (np.linalg.norm(one - other, axis=-1) <= NEAR * bound).mean(axis=-1) >= SAME
+
+
 def _congruent(
     points: Float[np.ndarray, "k 3"], others: Float[np.ndarray, "m 3"], tolerance: float,
     rng: np.random.Generator,
@@ -113,8 +120,7 @@ def _screened(
     """Choose the poses that bring most of some points near any target, and few of them to their partners."""
     moved = src @ np.swapaxes(rotation, 1, 2) + translation[:, None]
     near = cKDTree(targets).query(moved, distance_upper_bound=WIDE * bound)[0] < np.inf
-    stays = np.linalg.norm(moved - dst, axis=2) <= NEAR * bound
-    share = np.where(stays.mean(axis=1) < SAME, near.mean(axis=1), 0)
+    share = np.where(is_same(moved, dst, bound), 0, near.mean(axis=1))
     best = np.argsort(-share, kind="stable")[:FITTED]
     return best[share[best] >= LEAST_SCREENED]
 
@@ -142,7 +148,7 @@ def _distinct(
     kept, places = [], [dst]
     for other in found:
         moved = other.pose.apply(src)
-        if all((np.linalg.norm(moved - x, axis=1) <= NEAR * bound).mean() < SAME for x in places):
+        if not any(is_same(moved, x, bound) for x in places):
             kept.append(other)
             places.append(moved)
     return kept
