@@ -61,8 +61,7 @@ def other_poses(
     forth = _congruent(here, dst, 2 * noise_bound, rng)
     back = _congruent(there, src, 2 * noise_bound, rng)
     poses = _fit(*(np.concatenate(x) for x in zip(forth, back[::-1], strict=True)))
-    asked = rng.permutation(len(pairs))[:ASKED]
-    chosen = _screened(*poses, here[asked], there[asked], dst, noise_bound)
+    chosen = _screened(*poses, src, dst, rng.permutation(pairs)[:ASKED], noise_bound)
     found = [_fitted(poses[0][k], poses[1][k], src, dst, noise_bound) for k in chosen]
     return _distinct(sorted(found, key=lambda x: -x.explained), here, there, noise_bound)
 
@@ -114,13 +113,22 @@ def _fit(
 
 def _screened(
     rotation: Float[np.ndarray, "c 3 3"], translation: Float[np.ndarray, "c 3"],
-    src: Float[np.ndarray, "k 3"], dst: Float[np.ndarray, "k 3"], targets: Float[np.ndarray, "m 3"],
+    src: Float[np.ndarray, "n 3"], dst: Float[np.ndarray, "m 3"], pairs: Int[np.ndarray, "k 2"],
     bound: float,
 ) -> Int[np.ndarray, " f"]:  # fmt: skip
-    """Choose the poses that bring most of some points near any target, and few of them to their partners."""
-    moved = src @ np.swapaxes(rotation, 1, 2) + translation[:, None]
-    near = cKDTree(targets).query(moved, distance_upper_bound=WIDE * bound)[0] < np.inf
-    share = np.where(is_same(moved, dst, bound), 0, near.mean(axis=1))
+    """Choose the poses that bring most points of some pairs near others, and few of them to their partners.
+
+    The points of one cloud count: where it holds a thing twice, the other pose is about other points of it.
+    """
+    here, there = src[pairs[:, 0]], dst[pairs[:, 1]]
+    moved = here @ np.swapaxes(rotation, 1, 2) + translation[:, None]
+    back = (there - translation[:, None]) @ rotation
+    near = [
+        cKDTree(cloud).query(points, distance_upper_bound=WIDE * bound)[0] < np.inf
+        for cloud, points in ((dst, moved), (src, back))
+    ]
+    share = np.maximum(*(x.mean(axis=1) for x in near))
+    share = np.where(is_same(moved, there, bound), 0, share)
     best = np.argsort(-share, kind="stable")[:FITTED]
     return best[share[best] >= LEAST_SCREENED]
 
