@@ -8,7 +8,7 @@ all of them is proved at once. Things that are symmetric fit in several poses: t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -48,6 +48,10 @@ OTHERS = 2  # other poses that are looked at: the first clique may be mirrored, 
 # a matter of which points both clouds happen to hold.
 SHARE_OF_RIVAL = 0.8
 SETTINGS = Settings(clique=ExactClique(seconds=20.0))
+NO_CONSENSUS = (
+    "No pose explains more points than chance does: check that both clouds hold the same points, at least in "
+    "part, that noise_bound is in the unit of the target, and that scale is right."
+)
 
 
 class Rival(NamedTuple):
@@ -84,6 +88,11 @@ class AllToAll(Registration):
         """The pose as a matrix."""
         return np.asarray(self.pose.matrix, np.float64)
 
+    @cached_property
+    def advice(self) -> str:
+        """What happened and what to try, in sentences."""
+        return NO_CONSENSUS if self.status == Status.NO_CONSENSUS else self.status.advice
+
     def __repr__(self) -> str:
         first, *rest = summary(self).split("\n")
         rivals = ", ".join(f"{x.explained} pairs" for x in self.rivals) or "none found"
@@ -98,8 +107,8 @@ def all_to_all(
     Both clouds have to hold the same points, at least in part: corners, holes, centres of things, points that
     were thinned before one of them was moved. Points that two sensors drew from one surface are not the same:
     ``register_clouds`` is for those. Time and memory grow with the square of n m: a hundred points a side
-    take a second, two hundred half a minute. Points that are not finite are left out, and of equal ones all
-    but one.
+    take half a second, two hundred ten seconds and a gigabyte, and up to thirty where both clouds hold points
+    that the other lacks. Points that are not finite are left out, and of equal ones all but one.
 
     ``ok`` wants what it wants of ``register``, and that no other pose explains four fifths as many points:
     otherwise the status is ``AMBIGUOUS``.
@@ -127,7 +136,9 @@ def all_to_all(
             "all_to_all is nothing without a clique: give settings with another one than 'none'."
         )
     if scale is None:
-        raise ValueError("all_to_all needs a known scale: wrong matches outvote any other.")
+        raise ValueError(
+            "all_to_all needs a known scale: nearly all matches are wrong, and they outvote the right one."
+        )
     (a, i), (b, j) = (_usable(x, name) for x, name in ((src, "src"), (dst, "dst")))
     n, m = len(i), len(j)
     if n * m > MOST_MATCHES:
