@@ -15,6 +15,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:  # for editors and type checkers: at run time the table below is asked
     from teaser_jax import files, learn, metrics, plots, settings, so3, studies, synthetic
+    from teaser_jax.all_to_all import AllToAll, all_to_all
     from teaser_jax.certify.certificate import Certificate
     from teaser_jax.certify.error_bounds import error_bounds
     from teaser_jax.certify.pose import certify
@@ -40,7 +41,7 @@ if TYPE_CHECKING:  # for editors and type checkers: at run time the table below 
 # The module that each name of the front page lives in.
 _HOMES = {
     "register_clouds": "clouds.register", "CloudRegistration": "clouds.registration",
-    "prepare": "clouds.prepared",
+    "prepare": "clouds.prepared", "all_to_all": "all_to_all", "AllToAll": "all_to_all",
     "register": "register", "Registration": "register", "warmup": "register", "profile": "profile",
     "solve": "solve", "select": "solve", "refit": "refit", "soft_solve": "soft",
     "solve_batch": "solve_batch", "solve_rotation": "solve_rotation",
@@ -53,11 +54,11 @@ _HOMES = {
 _MODULES = ("files", "learn", "metrics", "plots", "settings", "so3", "studies", "synthetic")
 
 __all__ = [
-    "Certificate", "CloudRegistration", "Pose", "Problem", "Registration", "Selection", "Settings",
-    "Solution", "Status", "certify", "certify_rotation", "covariance", "error_bounds", "files",
-    "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare", "profile", "refit",
-    "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve", "solve_batch",
-    "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
+    "AllToAll", "Certificate", "CloudRegistration", "Pose", "Problem", "Registration", "Selection",
+    "Settings", "Solution", "Status", "all_to_all", "certify", "certify_rotation", "covariance",
+    "error_bounds", "files", "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare",
+    "profile", "refit", "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve",
+    "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
 ]  # fmt: skip
 
 

@@ -38,23 +38,26 @@ class Graph(NamedTuple):
     further: Float[Array, " n"]
 
 
-def prepare(p: Problem, settings: Settings, *, edge_dtype: Any = None, run: Run = plainly) -> Graph:
+def prepare(
+    p: Problem, settings: Settings, *, edge_dtype: Any = None, edges: Run | None = None, run: Run = plainly
+) -> Graph:
     """Find the scale and the consistency graph of a clean problem.
 
     Args:
         p: Clean.
         settings: How to solve.
         edge_dtype: The type in which edges are tested; None: that of the problem.
+        edges: Finds who agrees with whom; None: ``find_edges``.
         run: Runs each stage.
     """
     rows = run("rows", arrange, p)
     near = in_rows(p if edge_dtype is None else in_precision(p, edge_dtype), rows)
     scale, scale_pairs = run("scale", find_scale, near, settings)
     widening = run("widening", find_widening, near, scale, settings)
-    edges = run("consistency graph", find_edges, widened(near, widening), scale)
+    found = run("consistency graph", edges or find_edges, widened(near, widening), scale)
     dtype = p.src.dtype
     exact = scale.astype(dtype) if p.scale is None else p.scale
-    return Graph(rows, near.mask, exact, scale_pairs, widening.astype(dtype), *edges)
+    return Graph(rows, near.mask, exact, scale_pairs, widening.astype(dtype), *found)
 
 
 def in_precision(p: Problem, dtype: Any) -> Problem:

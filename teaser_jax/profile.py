@@ -106,8 +106,8 @@ class Stopwatch:
             start = time.perf_counter()
             output = jax.block_until_ready(run(*inputs, **choices))
             seconds = time.perf_counter() - start
-            if repeat == 0:
-                self.cold[name] = seconds
+            if repeat == 0:  # added up, for those who run a stage more than once
+                self.cold[name] = self.cold.get(name, 0.0) + seconds
             else:
                 self.warm.setdefault(name, []).append(seconds)
         return output

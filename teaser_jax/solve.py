@@ -96,18 +96,18 @@ def _at_the_door(problem: Any, settings: Any) -> tuple[Problem, Int[Array, ""]]:
 
 def choose(
     p: Problem, graph: Graph, clique: Clique, settings: Settings,
-    *, cascade: Run = find_cascade, run: Run = plainly,
+    *, cascade: Run = find_cascade, refinement: Run | None = None, run: Run = plainly,
 ) -> tuple[Selection, Bool[Array, ""]]:  # fmt: skip
     """Choose which measurements to trust, given the clique, and tell whether every iteration settled.
 
-    The problem is clean and its bounds are widened; ``cascade`` finds rotation and translation. Gradients:
-    none; the caller stops the inputs.
+    The problem is clean and its bounds are widened; ``cascade`` finds rotation and translation, and
+    ``refinement`` the inliers (None: ``find_inliers``). Gradients: none; the caller stops the inputs.
     """
     members = clique.members & p.mask
     found = cascade(p, graph.scale, members, settings, run)
     inliers, settled = members & jnp.all(found.axes, axis=1), found.settled
     if settings.refine:
-        inliers, still = run("refinement", find_inliers, p, found.pose, settings.refine)
+        inliers, still = run("refinement", refinement or find_inliers, p, found.pose, settings.refine)
         settled &= still
     refined = jnp.asarray(settings.refine is not None)
     sets = (graph.scale_pairs, members, found.tims, found.axes, inliers)
@@ -126,7 +126,8 @@ def find_inliers(
 
 def conclude(
     p: Problem, excluded: Int[Array, ""], graph: Graph, clique: Clique, settings: Settings,
-    *, offset: Float[AnyArray, "3"] | None = None, cascade: Run = find_cascade, run: Run = plainly,
+    *, offset: Float[AnyArray, "3"] | None = None, cascade: Run = find_cascade,
+    refinement: Run | None = None, run: Run = plainly,
 ) -> Solution:  # fmt: skip
     """Find what lies behind the clique: the sets, the pose, and whether to trust it; in the user's rows.
 
@@ -134,7 +135,9 @@ def conclude(
     """
     p = widened(in_rows(p, graph.rows), graph.widening)
     frozen, graph, clique = lax.stop_gradient((p, graph, clique))
-    selection, settled = choose(frozen, graph, clique, settings, cascade=cascade, run=run)
+    selection, settled = choose(
+        frozen, graph, clique, settings, cascade=cascade, refinement=refinement, run=run
+    )
     if settings.refine:
         fit = run("refit", joint_fit, p, selection)
         pose = fit.pose

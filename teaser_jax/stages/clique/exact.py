@@ -288,10 +288,9 @@ class _Search:
 
 def _as_words(edge_bits: UInt32[np.ndarray, "n w"]) -> UInt64[np.ndarray, "n v"]:
     """Turn rows of 32-bit words into rows of 64-bit words: the same bits, lower half first."""
-    bits = np.ascontiguousarray(edge_bits, np.uint32)
-    bits = np.pad(bits, ((0, 0), (0, bits.shape[1] % 2)))
-    low, high = bits[:, 0::2].astype(np.uint64), bits[:, 1::2].astype(np.uint64)
-    return np.ascontiguousarray(low | (high << np.uint64(32)))
+    little = np.zeros((len(edge_bits), edge_bits.shape[1] + edge_bits.shape[1] % 2), "<u4")
+    little[:, : edge_bits.shape[1]] = edge_bits
+    return little.view("<u8").astype(np.uint64, copy=False)  # the only copy: large graphs fill the memory
 
 
 def _unpack(row: UInt64[np.ndarray, " v"], n: int) -> Bool[np.ndarray, " n"]:
