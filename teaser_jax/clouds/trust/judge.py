@@ -30,6 +30,7 @@ FINE_ASKED = 5000  # of the finer cells
 FINER = 0.8  # of the width: another look is worth it only where cells become so much smaller
 # A pose is off by less than so many expected displacements: bent fragments by two and a half.
 SURELY = 3.0
+FIT_OF_GUESS = 0.60  # from which on an initial pose rules out rivals: a wrong one on hills fits 0.28
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +121,7 @@ class Limits(NamedTuple):
     of_fit: float = 0.82
     lead: float = 0.10
     against: float = 0.20
-    good_fit: float = 0.60
+    good_fit: float = 0.85
     whole: float = 0.9
 
 
@@ -196,7 +197,7 @@ def judge(
         rivals=rivals,
     )
     verdict = verdict_of(evidence, tolerance)
-    if guess is not None and evidence.fit >= LIMITS.good_fit and verdict.doubt in ("rival", "own", "plain"):
+    if guess is not None and evidence.fit >= FIT_OF_GUESS and verdict.doubt in ("rival", "own", "plain"):
         with pair.timed("verdict"):
             fewer = find_rivals(laid, seen, others, images=pair.images, guess=guess)
         evidence = replace(evidence, rivals=fewer)
