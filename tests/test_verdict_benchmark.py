@@ -88,7 +88,9 @@ def test_a_row_without_evidence_is_not_ok():
 
 def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("benchmarks.verdict.record.pairs", lambda count: [_Named("a"), _Named("b")][:count])
+    monkeypatch.setattr(
+        "benchmarks.verdict.record.pairs", lambda count, first: [_Named("a"), _Named("b")][:count]
+    )
     monkeypatch.setattr(
         "benchmarks.verdict.record._row",
         lambda pair, viewpoints: asked.append(pair.name) or {"name": pair.name},

@@ -18,12 +18,15 @@ from teaser_jax.clouds.trust.judge import LIMITS
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.verdict", description=__doc__)
     parser.add_argument("--places", type=int, default=8, help="of each kind")
+    parser.add_argument(
+        "--first", type=int, default=0, help="number of the first place: 8 and more were not fitted on"
+    )
     parser.add_argument("--viewpoints", action="store_true", help="tell where the sensors stood")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("verdict.jsonl"), help="a line for each pair"
     )
     asked = parser.parse_args()
-    rows = record(asked.output, asked.places, viewpoints=asked.viewpoints)
+    rows = record(asked.output, asked.places, first=asked.first, viewpoints=asked.viewpoints)
     print(report(rows))
 
 

@@ -116,7 +116,7 @@ class Limits(NamedTuple):
     own: float = 0.18
     visible: float = 0.008
     in_front: float = 0.10
-    beyond_planes: float = 0.02
+    beyond_planes: float = 0.01
     equal: float = 0.80
     of_fit: float = 0.82
     lead: float = 0.10
