@@ -30,10 +30,7 @@ def measured(truth: np.ndarray, i: int, j: int, rng: np.random.Generator, wrong=
     left = np.concatenate([turn, shift + np.cross(centroid, turn)])
     T = exp(left) @ T if wrong is None else wrong
     covariance = np.diag([SIGMA_SHIFT**2] * 3 + [SIGMA_TURN**2] * 3)
-    return MapPair(
-        i=i, j=j, status=Status.OK, doubt=None, T=T, covariance=covariance, centroid=centroid, displacement=0.06,
-        voxel_size=0.3, overlap=0.5, seconds=1.0,
-    )  # fmt: skip
+    return MapPair(i, j, Status.OK, None, T, covariance, centroid, 0.06, 0.3, 0.5, 1.0)
 
 
 def untrusted(i: int, j: int) -> MapPair:

@@ -63,6 +63,7 @@ def write_poses(
     *,
     format: Format | None = None,
     times: Any = None,
+    names: Sequence[str] | None = None,
 ) -> None:
     """Write several poses, one after the other. The file appears whole or not at all.
 
@@ -74,6 +75,7 @@ def write_poses(
             twelve numbers of [s R, t] in a line; "tum": time tx ty tz qx qy qz qw in a line, without a scale.
             None: "json" if the name ends in .json, "matrix" otherwise.
         times: (n,) for TUM [s]; None: 0, 1, 2 and so on.
+        names: What each is called, for JSON; None: nothing.
 
     Raises:
         OSError: If it cannot be written.

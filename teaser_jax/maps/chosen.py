@@ -7,7 +7,7 @@ from numbers import Integral
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from teaser_jax.ground.checks import shown
 from teaser_jax.maps.shelf import Shelf
@@ -99,19 +99,21 @@ def _kinds(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "k d"]:
     for _ in range(ROUNDS):
         nearest = _nearest(values, kinds)
         counts = np.bincount(nearest, minlength=KINDS)
-        sums = np.zeros_like(kinds)
-        np.add.at(sums, nearest, values)
+        sums = _summed(values, nearest)
         kinds = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], kinds)
     return kinds
 
 
 def _aggregated(values: Float[np.ndarray, "n d"], kinds: Float[np.ndarray, "k d"]) -> Float[np.ndarray, " m"]:
     nearest = _nearest(values, kinds)
-    found = np.zeros_like(kinds)
-    np.add.at(found, nearest, values - kinds[nearest])
+    found = _summed(values - kinds[nearest], nearest)
     found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-12)
     return found.ravel()
 
 
-def _nearest(values: Float[np.ndarray, "n d"], kinds: Float[np.ndarray, "k d"]) -> np.ndarray:
+def _summed(values: Float[np.ndarray, "n d"], kind: Int[np.ndarray, " n"]) -> Float[np.ndarray, "k d"]:
+    return np.stack([np.bincount(kind, column, KINDS) for column in values.T], axis=1)
+
+
+def _nearest(values: Float[np.ndarray, "n d"], kinds: Float[np.ndarray, "k d"]) -> Int[np.ndarray, " n"]:
     return np.argmin(np.sum(kinds**2, axis=1) - 2 * values @ kinds.T, axis=1)

@@ -18,14 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 from teaser_jax.maps.graph import Edge
-from teaser_jax.maps.motions import chained, inverse, log, turned_round
+from teaser_jax.maps.motions import Way, chained, inverse, log, turned_round
 
 GATE = 22.5  # of a squared error of six numbers, in standard deviations: 999 of 1000 are smaller
 # A group outvotes another one if it is so many times as large, and by so many.
 CLEARLY, AT_LEAST_BY = 2, 2
 SWAPS = 20
-
-Way = tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]
 
 
 class Gap(NamedTuple):
@@ -76,13 +74,13 @@ def consensus(edges: Sequence[Edge]) -> Consensus:
     """Find edges that agree with one another, as many as can be told.
 
     Args:
-        edges: At most one for two nodes.
+        edges: At most one for two nodes, the first node being the smaller one.
     """
     order = _most_confirmed_first(edges)
     web = _woven(edges, order)
     refusals = _refusals(web)
     for _ in range(SWAPS):
-        better = _outvoted(web, refusals, order)
+        better = _better(web, refusals, order)
         if better is None:
             break
         web, refusals = better, _refusals(better)
@@ -113,6 +111,11 @@ class _Web:
         self._ways.clear()
         self.graph.add_edge(edge.i, edge.j, weight=edge.spread, row=k)
 
+    @property
+    def apart(self) -> float:
+        """How far apart in time the nodes of refused edges are, on average."""
+        return float(np.mean([self.edges[k].j - self.edges[k].i for k in self.gaps] or [0]))
+
     def nodes_between(self, a: int, b: int) -> tuple[int, ...] | None:
         """Find the most certain way between two nodes; None: there is none."""
         if (a, b) not in self._ways:
@@ -131,15 +134,22 @@ class _Web:
 
 def _from(edge: Edge, node: int) -> Way:
     """Read an edge so that it begins at one of its nodes."""
-    return (edge.T, edge.covariance) if edge.i == node else turned_round(edge.T, edge.covariance)
+    way = edge.T, edge.covariance
+    return way if edge.i == node else turned_round(way)
+
+
+def _apart(way: Way, other: Way) -> tuple[Float[np.ndarray, "*n 6"], Float[np.ndarray, "*n"]]:
+    """Compute by what motion two ways differ, and its square in standard deviations."""
+    error = log(inverse(way[0]) @ other[0])
+    weighed = np.linalg.solve(way[1] + other[1], error[..., None])[..., 0]
+    return error, np.asarray(np.sum(error * weighed, axis=-1))
 
 
 def _gap(edge: Edge, way: Way, nodes: tuple[int, ...]) -> Gap:
     """Compare an edge with another way from its first to its second node."""
-    error = log(inverse(edge.T) @ way[0])
-    squared = float(error @ np.linalg.solve(edge.covariance + way[1], error))
+    error, squared = _apart((edge.T, edge.covariance), way)
     shift = float(np.linalg.norm(edge.T[:3, 3] - way[0][:3, 3]))
-    return Gap(nodes, shift, float(np.degrees(np.linalg.norm(error[:3]))), squared)
+    return Gap(nodes, shift, float(np.degrees(np.linalg.norm(error[:3]))), float(squared))
 
 
 def _most_confirmed_first(edges: Sequence[Edge]) -> list[int]:
@@ -147,21 +157,25 @@ def _most_confirmed_first(edges: Sequence[Edge]) -> list[int]:
 
     Where they are as many, neighbours in the order of the clouds come first: those share the most.
     """
-    rows = {frozenset((edge.i, edge.j)): k for k, edge in enumerate(edges)}
-    near: dict[int, set[int]] = {}
-    for edge in edges:
-        near.setdefault(edge.i, set()).add(edge.j)
-        near.setdefault(edge.j, set()).add(edge.i)
-    votes = np.zeros(len(edges), int)
-    for k, edge in enumerate(edges):
-        for third in near[edge.i] & near[edge.j]:
-            if third < max(edge.i, edge.j):
-                continue  # each triangle once, by its last node
-            sides = rows[frozenset((edge.i, third))], rows[frozenset((third, edge.j))]
-            way = chained(_from(edges[sides[0]], edge.i), _from(edges[sides[1]], third))
-            closes = _gap(edge, way, ()).error <= GATE
-            votes[[k, *sides]] += 1 if closes else -1
-    key = lambda k: (-votes[k], abs(edges[k].i - edges[k].j), edges[k].spread, k)
+    rows = {(edge.i, edge.j): k for k, edge in enumerate(edges)}
+    after: dict[int, list[int]] = {}
+    for i, j in rows:
+        after.setdefault(i, []).append(j)
+    sides = [
+        (rows[i, j], rows[j, k], rows[i, k])
+        for i, j in rows
+        for k in after.get(j, ())
+        if (i, k) in rows
+    ]  # fmt: skip
+    votes = np.zeros(len(edges))
+    if sides:
+        each = np.array(sides).T
+        T, C = np.array([x.T for x in edges]), np.array([x.covariance for x in edges])
+        first, second, direct = ((T[k], C[k]) for k in each)
+        closes = _apart(direct, chained(first, second))[1] <= GATE
+        signs = np.where(closes, 1, -1)
+        votes = np.sum([np.bincount(k, signs, len(edges)) for k in each], axis=0)
+    key = lambda k: (-votes[k], edges[k].j - edges[k].i, edges[k].spread, k)
     return sorted(range(len(edges)), key=key)
 
 
@@ -200,14 +214,24 @@ def _outvote(ours: int, theirs: int) -> bool:
     return ours >= CLEARLY * theirs and ours >= theirs + AT_LEAST_BY
 
 
-def _outvoted(web: _Web, refusals: dict[int, Refusal], order: Sequence[int]) -> _Web | None:
-    """Weave anew with a group of refused edges first, if that keeps more; None: no group does."""
+def _better(web: _Web, refusals: dict[int, Refusal], order: Sequence[int]) -> _Web | None:
+    """Weave anew with a group of refused edges first, if that is better; None: it is not for any group.
+
+    It is if the group outvotes what refuses it, and more edges are kept; or if neither outvotes the other,
+    and what is refused then lies further apart in time: scans that follow one another are believed.
+    """
+    tried = set()
     for k, refusal in refusals.items():
+        group = [x for x in web.gaps if x == k or _is_backed(web, k, x)]
+        if refusal.is_clear or frozenset(group) in tried:
+            continue
+        tried.add(frozenset(group))
+        other = _woven(web.edges, [*group, *(x for x in order if x not in group)])
         if _outvote(refusal.votes, refusal.against):
-            group = [x for x in web.gaps if x == k or _is_backed(web, k, x)]
-            other = _woven(web.edges, [*group, *(x for x in order if x not in group)])
             if len(other.kept) > len(web.kept):
                 return other
+        elif other.apart > web.apart:
+            return other
     return None
 
 

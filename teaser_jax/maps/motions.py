@@ -6,9 +6,14 @@ and ``covariance(convention="gtsam")``.
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+
+# Poses, and covariances of small motions to the right of them; one of each, or stacks.
+Way: TypeAlias = tuple[Float[np.ndarray, "*n 4 4"], Float[np.ndarray, "*n 6 6"]]
 
 
 def exp(motion: Float[np.ndarray, "*n 6"]) -> Float[np.ndarray, "*n 4 4"]:
@@ -50,18 +55,18 @@ def inverse(pose: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
     return back
 
 
-def adjoint(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6 6"]:
-    """Find the matrix that takes a motion to the right of a pose to its left: T Exp(x) = Exp(Ad x) T."""
-    rotation, shift = pose[:3, :3], pose[:3, 3]
-    found = np.zeros((6, 6))
-    found[:3, :3] = found[3:, 3:] = rotation
-    found[3:, :3] = cross(shift) @ rotation
+def adjoint(pose: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 6 6"]:
+    """Find the matrices that take a motion to the right of a pose to its left: T Exp(x) = Exp(Ad x) T."""
+    rotation = pose[..., :3, :3]
+    found = np.zeros((*pose.shape[:-2], 6, 6))
+    found[..., :3, :3] = found[..., 3:, 3:] = rotation
+    found[..., 3:, :3] = cross(pose[..., :3, 3]) @ rotation
     return found
 
 
-def cross(v: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def cross(v: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Write the cross product with a vector as a matrix."""
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]], np.float64)
+    return np.cross(v[..., None, :], -np.eye(3))
 
 
 def right_covariance(
@@ -88,19 +93,18 @@ def right_covariance(
     return change @ covariance @ change.T
 
 
-def chained(
-    first: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]],
-    second: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]],
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
-    """Chain two uncertain poses, T_ab and T_bc, whose errors are independent, to T_ac."""
+def chained(first: Way, second: Way) -> Way:
+    """Chain uncertain poses, T_ab and T_bc, whose errors are independent, to T_ac."""
     (T_ab, C_ab), (T_bc, C_bc) = first, second
-    change = adjoint(inverse(T_bc))
-    return T_ab @ T_bc, change @ C_ab @ change.T + C_bc
+    return T_ab @ T_bc, _carried(adjoint(inverse(T_bc)), C_ab) + C_bc
 
 
-def turned_round(
-    pose: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"]
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
-    """Invert an uncertain pose."""
-    change = adjoint(pose)
-    return inverse(pose), change @ covariance @ change.T
+def turned_round(way: Way) -> Way:
+    """Invert uncertain poses."""
+    return inverse(way[0]), _carried(adjoint(way[0]), way[1])
+
+
+def _carried(
+    change: Float[np.ndarray, "*n 6 6"], covariance: Float[np.ndarray, "*n 6 6"]
+) -> Float[np.ndarray, "*n 6 6"]:
+    return change @ covariance @ np.swapaxes(change, -1, -2)
