@@ -64,7 +64,7 @@ ORDER = [
     "studies.peers", "studies.trials", "studies.methods", "studies.study", "studies.draws",
     "studies.catalogue", "studies.shards",
     "studies.looks", "studies.table", "studies.answers", "studies.results", "studies.figures", "studies.run",
-    "cli.endings", "cli.places", "cli.report", "cli.clouds", "cli.register", "cli.demo", "cli.study",
+    "cli.endings", "cli.places", "cli.report", "cli.clouds", "cli.register", "cli.map", "cli.demo", "cli.study",
     "cli.arguments",
     "__main__",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,6 +104,10 @@ class CloudMap:
             cloud = self._shelf[k].cloud
             yield k, Pose.from_matrix(self.poses[k]).apply(cloud.points + cloud.origin)
 
+    def rows_used(self, k: int) -> Int[np.ndarray, " m"]:
+        """Give the rows of a cloud, as given, that are used; a cloud of a file is read once more."""
+        return self._shelf[k].cloud.rows
+
     def merged(self, voxel_size: float | None = None) -> Float[np.ndarray, "m 3"]:
         """Lay all placed clouds together in the frame of the map [length].
 
@@ -125,8 +129,3 @@ class CloudMap:
 
     def __repr__(self) -> str:
         return summary(self)
-
-
-def poses_placed(result: CloudMap) -> Sequence[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """List the names and the poses of the clouds that are placed."""
-    return [(result.names[k], result.poses[k]) for k in np.flatnonzero(result.placed)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -102,6 +103,7 @@ _job: Job | None = None  # of this worker
 
 def _begin(job: Job) -> None:
     global _job
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who presses a key is answered by the first process
     _job = job
 
 
