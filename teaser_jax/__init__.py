@@ -61,8 +61,8 @@ __all__ = [
     "Selection", "Settings", "Solution", "Status", "all_to_all", "certify", "certify_rotation", "covariance",
     "error_bounds", "files", "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare",
     "profile", "refit", "register", "register_clouds", "register_many", "select", "settings", "so3",
-    "soft_solve", "solve",
-    "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
+    "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic",
+    "verify", "warmup",
 ]  # fmt: skip
 
 

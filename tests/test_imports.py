@@ -64,8 +64,8 @@ ORDER = [
     "studies.peers", "studies.trials", "studies.methods", "studies.study", "studies.draws",
     "studies.catalogue", "studies.shards",
     "studies.looks", "studies.table", "studies.answers", "studies.results", "studies.figures", "studies.run",
-    "cli.endings", "cli.places", "cli.report", "cli.clouds", "cli.register", "cli.map", "cli.demo", "cli.study",
-    "cli.arguments",
+    "cli.endings", "cli.places", "cli.report", "cli.clouds", "cli.register", "cli.map", "cli.demo",
+    "cli.study", "cli.arguments",
     "__main__",
 ]  # fmt: skip
 MOST_LINES, MOST_LINES_OF_A_FUNCTION = 400, 50  # docstrings of functions apart

@@ -117,7 +117,7 @@ def _by_gtsam(
     how.setMaxIterations(ROUNDS)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, how).optimize()
     home = inverse(found.atPose3(anchor).matrix())
-    return {node: home @ found.atPose3(node).matrix() for node in start}
+    return {node: np.eye(4) if node == anchor else home @ found.atPose3(node).matrix() for node in start}
 
 
 def _by_scipy(
