@@ -36,6 +36,8 @@ def is_right(pair: MapPair, clouds: list[np.ndarray], truth: np.ndarray) -> bool
 
 def check_loop(result: CloudMap, clouds: list[np.ndarray], truth: np.ndarray) -> None:
     """No false pair is kept, no true one refused, and clouds are where they should be."""
+    assert not result.ok
+    assert len(result.doubts) >= 5
     assert all(is_right(pair, clouds, truth) for pair in result.kept)
     assert not any(is_right(pair, clouds, truth) for pair, _ in result.refused)
     first = np.flatnonzero(result.placed)[0]

@@ -136,6 +136,10 @@ def _add_map(map_: argparse.ArgumentParser) -> None:
     map_.add_argument(
         "--engine", choices=("gtsam", "scipy"), help="what optimises the poses (default: gtsam if installed)"
     )
+    map_.add_argument(
+        "--unordered", dest="ordered", action="store_false",
+        help="names do not tell the order in which the clouds were taken: then votes alone decide",
+    )  # fmt: skip
     for name, metavar, text in (
         ("seconds", "S", "begin no pair after so many seconds"),
         ("voxel-size", "V", "width of the cells that the verdict on a pair rests on (default: chosen)"),

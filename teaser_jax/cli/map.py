@@ -24,16 +24,9 @@ from teaser_jax.ground.io import one_line
 from teaser_jax.pose import Pose
 
 OPTIONS = (
-    "pairs",
-    "workers",
-    "engine",
-    "seconds",
-    "voxel_size",
-    "tolerance",
-    "max_range",
-    "viewpoint",
+    "pairs", "workers", "ordered", "engine", "seconds", "voxel_size", "tolerance", "max_range", "viewpoint",
     "threads",
-)
+)  # fmt: skip
 FORMATS: dict[str, Format] = {".json": "json", ".tum": "tum", ".kitti": "kitti"}
 
 

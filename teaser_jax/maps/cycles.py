@@ -1,9 +1,10 @@
 """Which answers to two clouds contradict the others: whoever walks round a cycle must come home.
 
 Two clouds alone can be wrong: two places may look alike. A false answer shows where it closes a cycle of
-true ones. Edges are taken one by one, those first that the most triangles confirm, and each must agree with
-the way that those before it make. What is refused is weighed against what refused it: if they are as many,
-no one can tell which are right, and that is said.
+true ones. Edges are taken one by one, and each must agree with the way that those before it make: first
+neighbours in time, which hardly ever take one place for another, then those that the most triangles confirm.
+What is refused is weighed against what refused it. Where two places look alike, false edges between them
+agree with one another, and may outnumber the true ones; then no one can tell, and that is said.
 """
 
 from __future__ import annotations
@@ -70,21 +71,23 @@ class Consensus:
     withheld: list[int]
 
 
-def consensus(edges: Sequence[Edge]) -> Consensus:
+def consensus(edges: Sequence[Edge], near: int) -> Consensus:
     """Find edges that agree with one another, as many as can be told.
 
     Args:
         edges: At most one for two nodes, the first node being the smaller one.
+        near: Up to how far apart in number nodes are neighbours in time, whose edges no others outvote;
+            0: numbers mean nothing.
     """
-    order = _most_confirmed_first(edges)
+    order = _most_confirmed_first(edges, near)
     web = _woven(edges, order)
     refusals = _refusals(web)
     for _ in range(SWAPS):
-        better = _better(web, refusals, order)
+        better = _better(web, refusals, order, near)
         if better is None:
             break
         web, refusals = better, _refusals(better)
-    withheld = _withheld(web, refusals)
+    withheld = _withheld(web, refusals, near)
     kept = sorted(k for k in web.kept if k not in withheld)
     return Consensus(kept, {k: refusals[k] for k in sorted(refusals)}, sorted(withheld))
 
@@ -111,10 +114,9 @@ class _Web:
         self._ways.clear()
         self.graph.add_edge(edge.i, edge.j, weight=edge.spread, row=k)
 
-    @property
-    def apart(self) -> float:
-        """How far apart in time the nodes of refused edges are, on average."""
-        return float(np.mean([self.edges[k].j - self.edges[k].i for k in self.gaps] or [0]))
+    def count_near(self, near: int) -> int:
+        """Count the kept edges of neighbours in time."""
+        return sum(self.edges[k].j - self.edges[k].i <= near for k in self.kept)
 
     def nodes_between(self, a: int, b: int) -> tuple[int, ...] | None:
         """Find the most certain way between two nodes; None: there is none."""
@@ -152,10 +154,10 @@ def _gap(edge: Edge, way: Way, nodes: tuple[int, ...]) -> Gap:
     return Gap(nodes, shift, float(np.degrees(np.linalg.norm(error[:3]))), float(squared))
 
 
-def _most_confirmed_first(edges: Sequence[Edge]) -> list[int]:
+def _most_confirmed_first(edges: Sequence[Edge], near: int) -> list[int]:
     """Order edges by the triangles that close with them, less those that do not.
 
-    Where they are as many, neighbours in the order of the clouds come first: those share the most.
+    Those of neighbours in time come before all others.
     """
     rows = {(edge.i, edge.j): k for k, edge in enumerate(edges)}
     after: dict[int, list[int]] = {}
@@ -175,7 +177,7 @@ def _most_confirmed_first(edges: Sequence[Edge]) -> list[int]:
         closes = _apart(direct, chained(first, second))[1] <= GATE
         signs = np.where(closes, 1, -1)
         votes = np.sum([np.bincount(k, signs, len(edges)) for k in each], axis=0)
-    key = lambda k: (-votes[k], edges[k].j - edges[k].i, edges[k].spread, k)
+    key = lambda k: (edges[k].j - edges[k].i > near, -votes[k], edges[k].spread, edges[k].i, edges[k].j)
     return sorted(range(len(edges)), key=key)
 
 
@@ -214,11 +216,11 @@ def _outvote(ours: int, theirs: int) -> bool:
     return ours >= CLEARLY * theirs and ours >= theirs + AT_LEAST_BY
 
 
-def _better(web: _Web, refusals: dict[int, Refusal], order: Sequence[int]) -> _Web | None:
+def _better(web: _Web, refusals: dict[int, Refusal], order: Sequence[int], near: int) -> _Web | None:
     """Weave anew with a group of refused edges first, if that is better; None: it is not for any group.
 
-    It is if the group outvotes what refuses it, and more edges are kept; or if neither outvotes the other,
-    and what is refused then lies further apart in time: scans that follow one another are believed.
+    It is if the group outvotes what refuses it, and more edges are kept, but none of neighbours in time is
+    lost; or if more of those are kept.
     """
     tried = set()
     for k, refusal in refusals.items():
@@ -227,15 +229,14 @@ def _better(web: _Web, refusals: dict[int, Refusal], order: Sequence[int]) -> _W
             continue
         tried.add(frozenset(group))
         other = _woven(web.edges, [*group, *(x for x in order if x not in group)])
-        if _outvote(refusal.votes, refusal.against):
-            if len(other.kept) > len(web.kept):
-                return other
-        elif other.apart > web.apart:
+        more_near = other.count_near(near) - web.count_near(near)
+        more = _outvote(refusal.votes, refusal.against) and len(other.kept) > len(web.kept)
+        if more_near > 0 or (more_near == 0 and more):
             return other
     return None
 
 
-def _withheld(web: _Web, refusals: dict[int, Refusal]) -> set[int]:
+def _withheld(web: _Web, refusals: dict[int, Refusal], near: int) -> set[int]:
     """Find kept edges that nothing confirms, that are contradicted by as many, and are no neighbours in time.
 
     Of a cloud that two edges place in two ways neither is known to be right. A chain of scans in their order
@@ -248,6 +249,6 @@ def _withheld(web: _Web, refusals: dict[int, Refusal]) -> set[int]:
             continue
         nodes = refusal.gap.nodes
         for a, b in zip(nodes, nodes[1:], strict=False):
-            if frozenset((a, b)) in bridges and abs(a - b) > 1:
+            if frozenset((a, b)) in bridges and abs(a - b) > near:
                 found.add(web.graph.edges[a, b]["row"])
     return found

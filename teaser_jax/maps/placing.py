@@ -41,17 +41,18 @@ class Placing(NamedTuple):
     bridges: list[int]
 
 
-def place(pairs: Sequence[MapPair], origins: Float[np.ndarray, "n 3"], engine: Engine) -> Placing:
+def place(pairs: Sequence[MapPair], origins: Float[np.ndarray, "n 3"], engine: Engine, near: int) -> Placing:
     """Lay clouds together by the pairs that agree.
 
     Args:
         pairs: At most one for two clouds; only those that are ok count.
         origins: The middle of each cloud in its own frame: the work is done between them [length].
         engine: What optimises the poses.
+        near: Up to how far apart in number clouds are neighbours in time; 0: numbers mean nothing.
     """
     rows = [k for k, pair in enumerate(pairs) if pair.ok]
     edges = {k: _edge(pairs[k], origins) for k in rows}
-    found = _rows_of(consensus([*edges.values()]), rows)
+    found = _rows_of(consensus([*edges.values()], near), rows)
     kept, strained = list(found.kept), dict[int, float]()
     poses, component = _settled(edges, kept, len(origins), engine)
     while (row := _worst(edges, kept, poses)) is not None:

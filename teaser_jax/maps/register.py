@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from teaser_jax.clouds.prepared import Prepared
 from teaser_jax.ground.checks import check_positive, shown, whole_number
-from teaser_jax.maps.chosen import pairs_to_ask
+from teaser_jax.maps.chosen import NEXT, pairs_to_ask
 from teaser_jax.maps.graph import Engine, engine_or_any
 from teaser_jax.maps.placing import place
 from teaser_jax.maps.result import CloudMap
@@ -30,6 +30,7 @@ def register_many(
     folder: str | PathLike[str] | None = None,
     workers: int = 1,
     seconds: float | None = None,
+    ordered: bool = True,
     engine: Engine | None = None,
     progress: bool | Callable[[str], None] = False,
     voxel_size: float | None = None,
@@ -48,7 +49,7 @@ def register_many(
 
     Args:
         clouds: Two or more, as ``register_clouds`` takes them, in one unit; paths are read when they are
-            needed. Neighbours in time should be neighbours in the list, but need not.
+            needed, in the order in which they were taken, or see ``ordered``.
         names: What to call them; None: as their files.
         pairs: "all"; "some": each cloud with the three that follow it and with five that look alike; a list
             of pairs of numbers; None: all of up to thirty clouds, some of more.
@@ -57,6 +58,8 @@ def register_many(
         workers: How many processes share the pairs. A script that asks for several needs the usual
             ``if __name__ == "__main__":``.
         seconds: A budget: no pair is begun after it [s].
+        ordered: Whether neighbours in the list are neighbours in time: pairs of those are not refused for
+            others, however many, as places that look alike lie apart in time. False: votes decide.
         engine: What optimises the poses, "gtsam" or "scipy"; None: GTSAM if it is installed.
         progress: Whether to show a bar on a terminal; or a function that is told.
         voxel_size, tolerance, refine: As in ``register_clouds``, for all pairs.
@@ -93,7 +96,7 @@ def register_many(
         done = _counted(done_pairs(job, asked, workers, left), show, "registering pairs", len(asked))
         answers = sorted(done, key=lambda pair: (pair.i, pair.j))
     took["pairs"] = time.perf_counter() - start - sum(took.values())
-    placing = place(answers, np.array([x.origin for x in looked]), engine)
+    placing = place(answers, np.array([x.origin for x in looked]), engine, NEXT if ordered else 0)
     took["placing"] = time.perf_counter() - start - sum(took.values())
     return CloudMap(tuple(shelf.names), tuple(answers), placing, engine, len(asked), took, shelf)
 
