@@ -100,6 +100,7 @@ def test_what_is_done_is_not_done_again(found, folder: Path, monkeypatch):
     np.testing.assert_array_equal(fewer.pairs[0].T, result.pairs[1].T)
 
 
+@pytest.mark.long
 def test_files_that_something_broke_are_asked_anew(found, folder: Path, monkeypatch, tmp_path: Path):
     result, store = found
     files = sorted(store.glob("pair_*.json"))
@@ -181,6 +182,7 @@ def test_a_budget_ends_the_work_and_is_said(folder: Path, monkeypatch):
     assert result.merged().shape == (0, 3)
 
 
+@pytest.mark.long
 def test_clouds_that_nothing_holds_are_not_placed():
     result = register_many([*STRIPS[:2], plane(0, 5000)], names=["a", "b", "flat"])
     assert not result.ok
@@ -251,6 +253,7 @@ def test_prepared_clouds_are_welcome():
     assert told[-1] == "registering pairs: 1 of 1"
 
 
+@pytest.mark.long
 def test_the_command_makes_a_map(folder: Path, tmp_path: Path, capsys):
     out, merged = tmp_path / "poses.json", tmp_path / "map.ply"
     command = ["map", str(folder), "-o", str(out), "--merged", str(merged)]

@@ -45,7 +45,10 @@ class CloudMap:
 
     @property
     def ok(self) -> bool:
-        """Whether all clouds are placed, all pairs were asked, and no contradiction is left open."""
+        """Whether all clouds are placed, all pairs were asked, and no contradiction is left open.
+
+        What no cycle holds is as sure as single pairs are: see ``confirmed``.
+        """
         return bool(self.placed.all()) and self.asked == len(self.pairs) and not self.doubts
 
     def __bool__(self) -> bool:
