@@ -24,6 +24,8 @@ if TYPE_CHECKING:  # for editors and type checkers: at run time the table below 
     from teaser_jax.clouds.prepared import prepare
     from teaser_jax.clouds.register import register_clouds
     from teaser_jax.clouds.registration import CloudRegistration
+    from teaser_jax.maps.register import register_many
+    from teaser_jax.maps.result import CloudMap
     from teaser_jax.plots.either import plot
     from teaser_jax.pose import Pose
     from teaser_jax.problem import Problem, host_problem, make_problem, stack_problems
@@ -42,6 +44,7 @@ if TYPE_CHECKING:  # for editors and type checkers: at run time the table below 
 _HOMES = {
     "register_clouds": "clouds.register", "CloudRegistration": "clouds.registration",
     "prepare": "clouds.prepared", "all_to_all": "all_to_all", "AllToAll": "all_to_all",
+    "register_many": "maps.register", "CloudMap": "maps.result",
     "register": "register", "Registration": "register", "warmup": "register", "profile": "profile",
     "solve": "solve", "select": "solve", "refit": "refit", "soft_solve": "soft",
     "solve_batch": "solve_batch", "solve_rotation": "solve_rotation",
@@ -54,11 +57,12 @@ _HOMES = {
 _MODULES = ("files", "learn", "metrics", "plots", "settings", "so3", "studies", "synthetic")
 
 __all__ = [
-    "AllToAll", "Certificate", "CloudRegistration", "Pose", "Problem", "Registration", "Selection",
-    "Settings", "Solution", "Status", "all_to_all", "certify", "certify_rotation", "covariance",
+    "AllToAll", "Certificate", "CloudMap", "CloudRegistration", "Pose", "Problem", "Registration",
+    "Selection", "Settings", "Solution", "Status", "all_to_all", "certify", "certify_rotation", "covariance",
     "error_bounds", "files", "host_problem", "learn", "make_problem", "metrics", "plot", "plots", "prepare",
-    "profile", "refit", "register", "register_clouds", "select", "settings", "so3", "soft_solve", "solve",
-    "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic", "verify", "warmup",
+    "profile", "refit", "register", "register_clouds", "register_many", "select", "settings", "so3",
+    "soft_solve", "solve", "solve_batch", "solve_rotation", "stack_problems", "studies", "synthetic",
+    "verify", "warmup",
 ]  # fmt: skip
 
 

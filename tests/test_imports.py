@@ -55,6 +55,8 @@ ORDER = [
     "clouds.symmetry", "clouds.parts.closed", "clouds.parts.turns", "clouds.parts.field",
     "clouds.parts.sweep", "clouds.parts.settle", "clouds.parts.sight", "clouds.parts.weigh",
     "clouds.parts.search", "clouds.parts.answer", "clouds.words", "clouds.registration", "clouds.register",
+    "maps.motions", "maps.pair", "maps.graph", "maps.cycles", "maps.placing", "maps.shelf", "maps.chosen",
+    "maps.store", "maps.work", "maps.words", "maps.result", "maps.register",
     "synthetic.protocol", "synthetic.solids", "synthetic.scans",
     "learn.matching", "learn.losses", "learn.teacher", "learn.network", "learn.training",
     "plots.style", "plots.panels", "plots.answer", "plots.scene", "plots.clouds", "plots.either",
@@ -62,8 +64,8 @@ ORDER = [
     "studies.peers", "studies.trials", "studies.methods", "studies.study", "studies.draws",
     "studies.catalogue", "studies.shards",
     "studies.looks", "studies.table", "studies.answers", "studies.results", "studies.figures", "studies.run",
-    "cli.endings", "cli.places", "cli.report", "cli.clouds", "cli.register", "cli.demo", "cli.study",
-    "cli.arguments",
+    "cli.endings", "cli.places", "cli.report", "cli.clouds", "cli.register", "cli.map", "cli.demo",
+    "cli.study", "cli.arguments",
     "__main__",
 ]  # fmt: skip
 MOST_LINES, MOST_LINES_OF_A_FUNCTION = 400, 50  # docstrings of functions apart

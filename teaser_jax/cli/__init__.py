@@ -1,4 +1,4 @@
-"""The command line: ``teaser-jax register MATCHES``, ``teaser-jax demo`` and ``teaser-jax study NAME``.
+"""The command line: ``teaser-jax register``, ``teaser-jax map``, ``teaser-jax demo``, ``teaser-jax study``.
 
 Exit codes: 0, the answer can be trusted; 1, there is no trustworthy answer and the status says
 why; 2, bad input, with one line on stderr that says what is wrong and what to do. With 2 no file

@@ -36,6 +36,7 @@ def parser() -> argparse.ArgumentParser:
     program.add_argument("--version", action="version", version=f"teaser-jax {__version__}")
     commands = program.add_subparsers(required=True, metavar="COMMAND", dest="command")
     _add_register(commands.add_parser("register", help="find the pose between two clouds, or behind matches"))
+    _add_map(commands.add_parser("map", help="register a folder of clouds to one map"))
     _add_demo(
         commands.add_parser("demo", help="register two scans, or a thousand matches, and draw the answer")
     )
@@ -93,18 +94,7 @@ def _add_clouds(register: argparse._ArgumentGroup) -> None:
         "--initial", type=Path, default=absent, metavar="TXT",
         help="a file with a pose near the answer, 4 x 4: only poses near it are looked for",
     )  # fmt: skip
-    register.add_argument(
-        "--crop", type=float, nargs=6, default=absent, metavar=("X", "Y", "Z", "X2", "Y2", "Z2"),
-        help="leave out points outside this box, in the frame of each cloud",
-    )  # fmt: skip
-    register.add_argument(
-        "--threads", type=int, default=absent, metavar="N",
-        help="how many threads to work with; they change no answer (default: one for each core)",
-    )  # fmt: skip
-    register.add_argument(
-        "--align", choices=ALIGNMENTS, default=absent,
-        help="how to align at last: by the shape of both clouds, by planes of the second (default: gicp)",
-    )  # fmt: skip
+    _add_reading(register)
     register.add_argument(
         "--html", type=_page, default=absent, metavar="HTML",
         help="write a page to turn and look at the answer from all sides",
@@ -112,6 +102,72 @@ def _add_clouds(register: argparse._ArgumentGroup) -> None:
     register.add_argument(
         "--merged", type=_merged, default=absent, metavar="PLY",
         help="write both clouds in the frame of the second, with their colours and intensity",
+    )  # fmt: skip
+
+
+def _add_map(map_: argparse.ArgumentParser) -> None:
+    absent = argparse.SUPPRESS
+    map_.add_argument(
+        "folder", metavar="FOLDER", type=Path,
+        help="its clouds, in the natural order of their names; text counts where there are no other clouds",
+    )  # fmt: skip
+    map_.add_argument("--json", action="store_true", help="print the map and all pairs as JSON")
+    map_.add_argument(
+        "-o", "--output", type=_output, metavar="TXT",
+        help="write T_map_cloud of each cloud that is placed: .json with names, .tum, .kitti, else 4 x 4",
+    )  # fmt: skip
+    map_.add_argument(
+        "--merged", type=_merged, metavar="PLY",
+        help="write all placed clouds in the frame of the map, with their colours and intensity",
+    )  # fmt: skip
+    map_.add_argument(
+        "--work", type=Path, metavar="DIR",
+        help="keep answers to pairs there: whatever ends the work, the same command goes on "
+        "(default: the name of the output and .pairs)",
+    )  # fmt: skip
+    map_.add_argument(
+        "--pairs", choices=("all", "some"),
+        help="which to ask: all, or neighbours in the order and clouds that look alike (default: all of up "
+        "to thirty clouds, some of more)",
+    )  # fmt: skip
+    map_.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="how many processes share the pairs (default: 1)"
+    )
+    map_.add_argument(
+        "--engine", choices=("gtsam", "scipy"), help="what optimises the poses (default: gtsam if installed)"
+    )
+    map_.add_argument(
+        "--unordered", dest="ordered", action="store_false",
+        help="names do not tell the order in which the clouds were taken: then votes alone decide",
+    )  # fmt: skip
+    for name, metavar, text in (
+        ("seconds", "S", "begin no pair after so many seconds"),
+        ("voxel-size", "V", "width of the cells that the verdict on a pair rests on (default: chosen)"),
+        ("tolerance", "L", "how far points of an overlap may be off at the most (default: two voxels)"),
+        ("max-range", "L", "leave out points further from the viewpoint, or the origin"),
+    ):
+        map_.add_argument(f"--{name}", type=float, default=absent, metavar=metavar, help=text)
+    map_.add_argument(
+        "--viewpoint", type=float, nargs=3, default=absent, metavar=("X", "Y", "Z"),
+        help="where the sensor of each cloud stood, in its own frame, as 0 0 0",
+    )  # fmt: skip
+    _add_reading(map_)
+
+
+def _add_reading(command: argparse.ArgumentParser | argparse._ArgumentGroup) -> None:
+    """Add what is asked of two clouds and of many alike."""
+    absent = argparse.SUPPRESS
+    command.add_argument(
+        "--crop", type=float, nargs=6, default=absent, metavar=("X", "Y", "Z", "X2", "Y2", "Z2"),
+        help="leave out points outside this box, in the frame of each cloud",
+    )  # fmt: skip
+    command.add_argument(
+        "--threads", type=int, default=absent, metavar="N",
+        help="how many threads to work with; they change no answer (default: one for each core)",
+    )  # fmt: skip
+    command.add_argument(
+        "--align", choices=ALIGNMENTS, default=absent,
+        help="how to align at last: by the shape of both clouds, by planes of the second (default: gicp)",
     )  # fmt: skip
 
 

@@ -19,14 +19,16 @@ from teaser_jax.cli.places import (
     draw_clouds,
     failures_named,
     tell_unwritten,
+    write_merged,
     write_page,
     writing,
 )
 from teaser_jax.cli.report import clouds_as_plain_data
 from teaser_jax.files.cloud_file import CloudFile
-from teaser_jax.files.clouds import read_cloud, write_cloud
+from teaser_jax.files.clouds import read_cloud
 from teaser_jax.files.poses import read_poses, write_pose
 from teaser_jax.ground.io import one_line
+from teaser_jax.pose import as_pose
 
 OPTIONS = (
     "voxel_size", "tolerance", "src_viewpoint", "dst_viewpoint", "initial_error", "max_range", "threads",
@@ -113,7 +115,8 @@ def _write(
         if places["html"] is not None:
             write_page(until_all_is_well.enter_context(writing(places["html"])), result, title)
         if result.ok and places["merged"] is not None:
-            _write_merged(until_all_is_well.enter_context(writing(places["merged"])), result, src, dst)
+            there = until_all_is_well.enter_context(writing(places["merged"]))
+            write_merged(there, [(src, result.pose), (dst, as_pose(np.eye(4)))])
         if result.ok and places["output"] is not None:
             with failures_named(places["output"]):
                 write_pose(places["output"], result.pose)
@@ -121,15 +124,3 @@ def _write(
         if path is not None and not result.ok:
             with failures_named(path):
                 path.unlink(missing_ok=True)
-
-
-def _write_merged(path: Path, result: tj.CloudRegistration, src: CloudFile, dst: CloudFile) -> None:
-    """Write both clouds in the frame of the target, with colours and intensity where both have them."""
-    finite = [np.isfinite(x.points).all(axis=1) for x in (src, dst)]
-    points = np.concatenate([result.pose.apply(src.points[finite[0]]), dst.points[finite[1]]])
-    both: dict[str, Any] = {}
-    for name in ("colours", "intensity"):
-        ours, theirs = getattr(src, name), getattr(dst, name)
-        if ours is not None and theirs is not None:
-            both[name] = np.concatenate([ours[finite[0]], theirs[finite[1]]])
-    write_cloud(path, points, **both)

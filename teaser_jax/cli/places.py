@@ -12,8 +12,11 @@ import numpy as np
 
 from teaser_jax.cli.endings import BadInput
 from teaser_jax.clouds.registration import CloudRegistration
+from teaser_jax.files.cloud_file import CloudFile
+from teaser_jax.files.clouds import write_cloud
 from teaser_jax.ground.extras import needed
 from teaser_jax.ground.io import one_line, replacing
+from teaser_jax.pose import Pose
 from teaser_jax.register import Registration
 
 # What the options that name files are for.
@@ -106,6 +109,24 @@ def write_page(path: Path, result: CloudRegistration, title: str) -> None:
     from teaser_jax.plots import write_view
 
     write_view(path, result, title=title)
+
+
+def write_merged(path: Path, clouds: Sequence[tuple[CloudFile, Pose]]) -> None:
+    """Write clouds in one frame, with colours and intensity where all have them.
+
+    Args:
+        path: Where to.
+        clouds: Each with the pose that brings it there.
+    """
+    finite = [np.isfinite(cloud.points).all(axis=1) for cloud, _ in clouds]
+    points = [pose.apply(cloud.points[rows]) for (cloud, pose), rows in zip(clouds, finite, strict=True)]
+    shared: dict[str, np.ndarray] = {}
+    for name in ("colours", "intensity"):
+        columns = [getattr(cloud, name) for cloud, _ in clouds]
+        if all(column is not None for column in columns):
+            kept = [column[rows] for column, rows in zip(columns, finite, strict=True)]
+            shared[name] = np.concatenate(kept)
+    write_cloud(path, np.concatenate(points), **shared)
 
 
 @contextmanager

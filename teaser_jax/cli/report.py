@@ -1,4 +1,4 @@
-"""The answers of ``teaser-jax register`` as JSON, and their errors where the truth is known."""
+"""The answers of ``teaser-jax register`` and ``map`` as JSON, and their errors where the truth is known."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from teaser_jax import metrics
 from teaser_jax.certify.certificate import Certificate, CertificateStatus, CertifiedBy
 from teaser_jax.clouds.registration import CloudRegistration
+from teaser_jax.maps.result import CloudMap
 from teaser_jax.pose import Pose
 from teaser_jax.register import Registration
 
@@ -106,6 +107,42 @@ def clouds_as_plain_data(result: CloudRegistration) -> dict[str, Any]:
             "lead": _plain(e.rivals.lead.share),
         }
     return report
+
+
+def map_as_plain_data(result: CloudMap) -> dict[str, Any]:
+    """Turn a map into what JSON can hold; clouds that are not placed have null for a pose."""
+    return {
+        "ok": result.ok,
+        "engine": result.engine,
+        "clouds": [
+            {
+                "name": name,
+                "placed": bool(result.placed[k]),
+                "confirmed": bool(result.confirmed[k]),
+                "component": int(result.component[k]),
+                "T_map_cloud": _plain(result.poses[k]) if result.placed[k] else None,
+            }
+            for k, name in enumerate(result.names)
+        ],
+        "pairs": [
+            {
+                "dst": result.names[pair.i],
+                "src": result.names[pair.j],
+                "status": pair.status.name,
+                "doubt": pair.doubt,
+                "ok": pair.ok,
+                "kept": k in result.placing.kept,
+                "why": result.why(pair.i, pair.j),
+                "T_dst_src": _plain(pair.T),
+                "displacement": _plain(pair.displacement),
+                "voxel_size": _plain(pair.voxel_size),
+            }
+            for k, pair in enumerate(result.pairs)
+        ],
+        "not_asked": result.asked - len(result.pairs),
+        "doubts": result.doubts,
+        "seconds": {name: round(value, 6) for name, value in result.seconds.items()},
+    }
 
 
 def _pose(pose: Pose) -> dict[str, Any]:

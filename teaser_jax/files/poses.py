@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -54,7 +54,7 @@ def write_pose(path: str | PathLike[str], pose: Pose | Any, *, format: Format | 
         OSError: If it cannot be written.
         ValueError: If it is no pose; then no file changes.
     """
-    _write(path, [as_pose(pose)], None, format)
+    _write(path, [as_pose(pose)], format)
 
 
 def write_poses(
@@ -63,6 +63,7 @@ def write_poses(
     *,
     format: Format | None = None,
     times: Any = None,
+    names: Sequence[str] | None = None,
 ) -> None:
     """Write several poses, one after the other. The file appears whole or not at all.
 
@@ -74,16 +75,23 @@ def write_poses(
             twelve numbers of [s R, t] in a line; "tum": time tx ty tz qx qy qz qw in a line, without a scale.
             None: "json" if the name ends in .json, "matrix" otherwise.
         times: (n,) for TUM [s]; None: 0, 1, 2 and so on.
+        names: What each is called, for JSON; None: nothing.
 
     Raises:
         OSError: If it cannot be written.
         ValueError: If one is no pose, or has a scale and the format has none; then no file changes.
     """
     each = as_pose(poses).matrix if isinstance(poses, Pose) else poses
-    _write(path, [as_pose(pose) for pose in each], times, format)
+    _write(path, [as_pose(pose) for pose in each], format, times, names)
 
 
-def _write(path: str | PathLike[str], poses: list[Pose], times: Any, format: str | None) -> None:
+def _write(
+    path: str | PathLike[str],
+    poses: list[Pose],
+    format: str | None,
+    times: Any = None,
+    names: Sequence[str] | None = None,
+) -> None:
     path = Path(path)
     format = format or ("json" if path.suffix.lower() == ".json" else "matrix")
     if format not in ("matrix", "json", "kitti", "tum"):
@@ -92,8 +100,14 @@ def _write(path: str | PathLike[str], poses: list[Pose], times: Any, format: str
         raise ValueError(f"times are given, and the format '{format}' has none: 'tum' has.")
     if any(np.ndim(pose.matrix) != 2 for pose in poses):
         raise ValueError("received a batch of poses for one: give them to write_poses.")
+    if names is not None and (format != "json" or len(names) != len(poses)):
+        raise ValueError(
+            f"{len(names)} names are given: 'json' has them, one for each of {len(poses)} pose(s)."
+        )
     if format == "json":
         listed = [_described(pose) for pose in poses]
+        if names is not None:
+            listed = [{"name": name, **one} for name, one in zip(names, listed, strict=True)]
         text = json.dumps(listed[0] if len(listed) == 1 else {"poses": listed}, indent=1) + "\n"
         with replacing(path) as partial:
             partial.write_text(text)
