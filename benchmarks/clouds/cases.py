@@ -47,7 +47,7 @@ FAMILIES = {
     "3dmatch_other": Family("3DMatch, other", 15.0, 0.3, 0.05, 0),
     "kitti00": Family("KITTI 00", 5.0, 0.6, 0.3, 1),
     "kitti07_submaps": Family("KITTI 07 submaps", 5.0, 0.6, 0.3, 1),
-    "bunny_scans": Family("bunny scans", 5.0, 0.005, 0.002, 1),
+    "bunny_scans": Family("bunny scans", 5.0, 0.005, 0.0015, 1),
     "cranfield": Family("CAD to scan", 10.0, 0.005, 0.002, 9),
 }
 SCENE_NAMES = {
