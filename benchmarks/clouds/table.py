@@ -98,11 +98,10 @@ def report(rows: list[dict]) -> str:
     places = sum(family.places for family in FAMILIES.values())
     lines = [
         "Raw clouds. Ours is given no parameter; KISS-Matcher and Open3D get a width of cells that suits",
-        "the family, KISS-Matcher also the one that ours finds. Open3D runs its tutorial's FPFH, RANSAC",
-        "with ten times the iterations there, or FGR, and ICP at last; its normals look to the sensor",
-        "where that is at the origin. KISS-Matcher's `ok` is `valid` and five final inliers, as its",
-        "examples ask; Open3D says none. The real pairs are few places "
-        f"({places} in all, nine of them parts), and the limits below count pairs.",
+        "the family, KISS-Matcher also the one that ours finds. Open3D runs FPFH, RANSAC or FGR, and ICP",
+        "as its tutorial does; its normals look to the sensor where that is at the origin. KISS-Matcher's",
+        "`ok` is `valid` and five final inliers, as its examples ask; Open3D says none. The real pairs are",
+        f"few places ({places} in all, nine of them parts), and the limits below count pairs.",
     ]
     lines += [f"Left out: {r['package']} ({r['why']})." for r in rows if r["part"] == "missing"]
     for section in (_recall, _worth, _displacements, _statuses, _times, _memory):
