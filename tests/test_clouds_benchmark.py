@@ -95,9 +95,7 @@ def row(**known) -> dict:
     usual = dict(
         part="asked", method="ours", kind="a", says_ok=True, right_or_equivalent=0, displacement=None
     )
-    more = dict(
-        ok_beyond_two_voxels=0, statuses={"OK": 1}, status_right=0, wrong_ok=[], voxels=None, seconds=None
-    )
+    more = dict(ok_beyond_two_voxels=0, statuses={"OK": 1}, status_right=0, wrong_ok=[], seconds=[2.0, 3.0])
     return {**usual, **more, **known}
 
 
@@ -133,6 +131,7 @@ def test_the_report_says_what_was_counted():
     assert "Left out: open3d (no libusb)." in text
     assert "| a | 8 / 9 of 10 (6 + 1) |" in text
     assert "6 of 8, above" in text
+    assert "| a | 3.0 |" in text
     assert "| none | 1 of 20 |" in text
     assert "Wrong and ok by ours: x y." not in text  # it is not ours
     assert "Wrong and ok by ours: x y." in table.report([{**r, "method": "teaser_jax"} for r in ROWS])
@@ -152,7 +151,11 @@ def test_a_method_that_fails_has_no_answer():
 @pytest.mark.parametrize("name", [name for name in find_methods()[0] if name != "teaser_jax"])
 def test_a_peer_finds_hills_and_tells_the_time_of_its_stages(name):
     src, dst = next(scene for scene in SCENES if scene.name.startswith("hills")).clouds(0)
-    pair = CloudPair("hills", "", TRUTH.inverse().apply(src[::4]), dst[::4], (TRUTH,), 5.0, 0.5, 0.5)
+    src, dst = (x[::4] - [14, 10, 9] for x in (src, dst))  # both seen from above the middle
+    turn = Pose(TRUTH.rotation, np.zeros(3), np.float64(1))
+    pair = CloudPair(
+        "hills", "", turn.inverse().apply(src), dst, (turn,), 5.0, 0.5, 0.5, seen_from_origin=True
+    )
     said = find_methods()[0][name](pair)
     assert pair.is_right(said.pose)
     assert set(said.seconds) >= {"cells", "descriptors", "solving"}

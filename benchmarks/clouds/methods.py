@@ -20,6 +20,7 @@ from teaser_jax.clouds.pair import USUAL_CELLS, Pair
 
 OURS, KISS, KISS_CELLS = "teaser_jax", "KISS-Matcher", "KISS-Matcher, our cells"
 RANSAC, FGR = "Open3D RANSAC", "Open3D FGR"
+SILENT = (RANSAC, FGR)  # they never say whether to trust a pose
 FEWEST_INLIERS = 5  # below which the examples of KISS-Matcher say that it might have failed
 FINEST, COARSER = 0.01, 0.1  # [m]: KISS-Matcher refuses cells below 5 mm, so smaller clouds are made larger
 ITERATIONS, CONFIDENCE = 100_000, 0.999  # of RANSAC: ten times as many were right on the same pairs
