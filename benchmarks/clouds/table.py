@@ -52,7 +52,7 @@ def _row(kind: str, method: str, answers: list[tuple[CloudPair, Answer]]) -> dic
         "answers": sum(bool(p.truths) for p, _ in answers),
         "right": len(right),
         "right_or_equivalent": listed,
-        "says_ok": any(a.ok is not None for _, a in answers),
+        "says_ok": method not in SILENT,
         "ok": sum(bool(a.ok) for _, a in answers),
         "ok_right": sum(bool(a.ok) for _, a in right),
         "ok_beyond_two_voxels": int(sum(far)),
