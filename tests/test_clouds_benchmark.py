@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -137,10 +138,45 @@ def test_the_report_says_what_was_counted():
     assert "Wrong and ok by ours: x y." in table.report([{**r, "method": "teaser_jax"} for r in ROWS])
 
 
-def test_a_method_that_fails_has_no_answer():
-    def fails(pair: CloudPair) -> Answer:
-        raise RuntimeError("no keypoints")
+def test_a_run_that_ended_goes_on_and_then_forgets(tmp_path, monkeypatch):
+    calls = []
 
+    def turns(pair: CloudPair) -> Answer:
+        calls.append(pair.name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return Answer(TRUTH, True, "OK", (turned("x", 180),), 0.1, {"all": 1.0}, 1.0, 2.0)
+
+    several = [replace(PAIR, name=name) for name in "ab"] + [replace(PAIR, kind="none", name="c", truths=())]
+    monkeypatch.setattr(table, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(table, "find_methods", lambda: ({"teaser_jax": turns, "Open3D FGR": fails}, {}))
+    monkeypatch.setattr(table, "pairs", lambda quick: several)
+    monkeypatch.setattr(table, "timed", lambda quick: [])
+    with pytest.raises(KeyboardInterrupt):
+        table.run(quick=False)
+    rows = {(r["kind"], r["method"]): r for r in table.run(quick=False)}
+    assert calls == ["a", "b", "b", "c"]
+    assert (rows["cube", "teaser_jax"]["right"], rows["cube", "teaser_jax"]["ok_right"]) == (2, 2)
+    assert rows["cube", "Open3D FGR"]["right"] == 0
+    assert ("none", "Open3D FGR") not in rows  # it never says ok
+    assert rows["none", "teaser_jax"]["wrong_ok"] == ["c"]
+    assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def fails(pair: CloudPair) -> Answer:
+    raise RuntimeError("no keypoints")
+
+
+def test_an_answer_is_kept_as_it_is():
+    said = Answer(TRUTH, None, "OK", (turned("x", 180),), np.nan, {"all": 1.0}, 1.0, 2.0)
+    again = Answer.of_row(json.loads(json.dumps(said.as_row())))
+    np.testing.assert_array_equal(again.pose.matrix, said.pose.matrix)
+    np.testing.assert_array_equal(again.others[0].matrix, said.others[0].matrix)
+    assert (again.ok, again.status, again.seconds, again.cpu) == (None, "OK", {"all": 1.0}, 2.0)
+    assert Answer.of_row(asked(fails, PAIR).as_row()).pose is None
+
+
+def test_a_method_that_fails_has_no_answer():
     said = asked(fails, PAIR)
     assert (said.pose, said.ok, said.status) == (None, False, "RuntimeError")
     counted = table._row("cube", "fails", [(PAIR, said)])

@@ -19,6 +19,7 @@ from teaser_jax import Pose, metrics
 
 FOLDER = DATA / "cloud_pairs"
 QUICK = 2  # pairs of each kind
+OTHERS = 24  # pairs of other places, besides those of two streets
 SOME = 2000  # points of a source that tell how far it is off
 REVOLVED = {"cad_Round-Peg": np.array([0.0, 1.0, 0.0])}  # only where its axis lies can be asked
 ROOM_OF = {"3dmatch_other": "3dmatch_kitchen"}  # another recording of the same room
@@ -170,7 +171,7 @@ def _clouds_of() -> dict[str, list[str]]:
 
 
 def _elsewhere() -> Iterator[CloudPair]:
-    """Clouds of two places, the source as large as the target: nine of two streets, and 24 others."""
+    """Clouds of two places, the source as large as the target: nine of two streets, and others."""
     places, rng = _clouds_of(), np.random.default_rng(0)
     if not places:
         return
@@ -178,12 +179,15 @@ def _elsewhere() -> Iterator[CloudPair]:
         src = places["kitti00"][k]
         yield _without(OTHER, src, dst, "kitti07_submaps", _cloud(src))
     names = sorted(places)
-    for _ in range(24):
+    chosen: dict[tuple[str, str], str] = {}
+    while len(chosen) < OTHERS:
         a, b = rng.choice(len(names), 2, replace=False)
         src, dst = (str(rng.choice(places[names[k]])) for k in (a, b))
+        chosen[src, dst] = names[b]
+    for (src, dst), place in chosen.items():
         finite = (x[np.isfinite(x).all(axis=1)] for x in (_cloud(src), _cloud(dst)))
         sizes = [np.ptp(x, axis=0).max() for x in finite]
-        yield _without(OTHER, src, dst, names[b], _cloud(src) * (sizes[1] / sizes[0]))
+        yield _without(OTHER, src, dst, place, _cloud(src) * (sizes[1] / sizes[0]))
 
 
 def _wrong_models() -> Iterator[CloudPair]:

@@ -6,7 +6,6 @@ Every answer is kept as soon as it is there, so that a run that ended goes on wh
 from __future__ import annotations
 
 import csv
-import json
 import zlib
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -18,10 +17,11 @@ from tqdm import tqdm
 
 import teaser_jax as tj
 from benchmarks.clouds.cases import CloudPair
+from benchmarks.clouds.kept import Kept, code
 from benchmarks.clouds.lists import ListedPair
-from benchmarks.clouds.methods import Method, asked
-from teaser_jax.files import FileError, read_cloud
-from teaser_jax.ground.io import or_file_error, os_errors_named, replacing
+from benchmarks.clouds.methods import Answer, Method, asked
+from teaser_jax.files import read_cloud
+from teaser_jax.ground.io import os_errors_named, replacing
 from teaser_jax.pose import Pose
 
 KEPT, TABLE = "answers.jsonl", "table.csv"
@@ -73,51 +73,24 @@ def evaluate(
     """
     with os_errors_named(output, "cannot be written"):
         output.mkdir(parents=True, exist_ok=True)
-        kept = read_kept(output / KEPT, _origin(listed))
+        kept = Kept(output / KEPT, _origin(listed))
         cloud = lru_cache(CLOUDS)(lambda path: read_cloud(path).points.astype(np.float64))
-        with (output / KEPT).open("a") as file, tqdm(total=len(listed), disable=None) as bar:
+        with tqdm(total=len(listed), disable=None) as bar:
             for one in listed:
                 bar.set_description(f"{one.scene}: {one.name}")
-                todo = [name for name in methods if (one.scene, one.name, name) not in kept]
-                for name in todo:
-                    row = _answer(methods[name], _pair(one, kind, cloud))
-                    kept[one.scene, one.name, name] = row
-                    file.write(json.dumps([one.scene, one.name, name, row]) + "\n")
-                    file.flush()
+                for name, method in methods.items():
+                    if (key := (one.scene, one.name, name)) not in kept.rows:
+                        kept.add(key, asked(method, _pair(one, kind, cloud)).as_row())
                 bar.update()
         rows = list(_table(listed, kind, list(methods), kept))
         _write(output / TABLE, rows)
     return rows
 
 
-def read_kept(path: Path, origin: dict) -> dict[tuple[str, str, str], dict]:
-    """Read the answers of an earlier run, and begin the file where there is none.
-
-    A last line that a kill cut off is dropped.
-
-    Raises:
-        FileError: If they answer other pairs, or the file is broken.
-        OSError: If it cannot be written.
-    """
-    if not path.exists():
-        path.write_text(json.dumps(origin) + "\n")
-    text = path.read_text()
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        with replacing(path) as partial:
-            partial.write_text(whole)
-    head, *rows = or_file_error(
-        path, "is broken", lambda: [json.loads(line) for line in whole.splitlines()] or [None]
-    )
-    if head != origin:
-        raise FileError(f"{path}: answers other pairs, or is of another version: name another folder.")
-    return {(scene, name, method): row for scene, name, method, row in rows}
-
-
 def _origin(listed: list[ListedPair]) -> dict:
-    """What answers belong to."""
+    """What answers belong to: the pairs, and this code."""
     text = "\n".join(f"{x.scene} {x.name} {np.asarray(x.truth.matrix).tolist()}" for x in listed)
-    return {"pairs": zlib.crc32(text.encode()), "teaser_jax": tj.__version__}
+    return {"pairs": zlib.crc32(text.encode()), "code": code()}
 
 
 def _pair(one: ListedPair, kind: Kind, cloud: Callable[[Path], np.ndarray]) -> CloudPair:
@@ -126,12 +99,6 @@ def _pair(one: ListedPair, kind: Kind, cloud: Callable[[Path], np.ndarray]) -> C
         one.scene, one.name, cloud(one.src), cloud(one.dst), (one.truth,), *limits, kind.voxel,
         seen_from_origin=True,
     )  # fmt: skip
-
-
-def _answer(method: Method, pair: CloudPair) -> dict:
-    said = asked(method, pair)
-    matrix = None if said.pose is None else np.asarray(said.pose.matrix).tolist()
-    return {"T_dst_src": matrix, "ok": said.ok, "status": said.status, "wall": said.wall, "cpu": said.cpu}
 
 
 def fit_error(pose: Pose, one: ListedPair) -> float:
@@ -146,18 +113,19 @@ def fit_error(pose: Pose, one: ListedPair) -> float:
 
 
 def _table(
-    listed: list[ListedPair], kind: Kind, methods: list[str], kept: dict
+    listed: list[ListedPair], kind: Kind, methods: list[str], kept: Kept
 ) -> Iterator[dict[str, str | float]]:
     """A row a method and scene, and one for all pairs."""
     scenes = list(dict.fromkeys(one.scene for one in listed))
     for method in methods:
         for scene in [*scenes, "all"]:
             own = [one for one in listed if scene in (one.scene, "all")]
-            yield _row(scene, method, kind, [(one, kept[one.scene, one.name, method]) for one in own])
+            said = (Answer.of_row(kept.rows[one.scene, one.name, method]) for one in own)
+            yield _row(scene, method, kind, list(zip(own, said, strict=True)))
 
 
 def _row(
-    scene: str, method: str, kind: Kind, answers: list[tuple[ListedPair, dict]]
+    scene: str, method: str, kind: Kind, answers: list[tuple[ListedPair, Answer]]
 ) -> dict[str, str | float]:
     errors = np.array([_errors(one, said) for one, said in answers])
     row: dict[str, str | float] = {"scene": scene, "method": method, "pairs": len(answers)}
@@ -166,28 +134,22 @@ def _row(
         row[f"recall {limits.name}"] = float(right.mean())
     counted = [(one, said) for one, said in answers if one.information is not None and not one.is_next]
     if counted:
-        fits = [
-            said["T_dst_src"] is not None
-            and fit_error(Pose.from_matrix(np.array(said["T_dst_src"])), one) < FIT
-            for one, said in counted
-        ]
+        fits = [said.pose is not None and fit_error(said.pose, one) < FIT for one, said in counted]
         row |= {"not neighbours": len(counted), f"recall {FIT} m rms": float(np.mean(fits))}
-    if any(said["ok"] is not None for _, said in answers):
-        ok = np.array([bool(said["ok"]) for _, said in answers])
+    if any(said.ok is not None for _, said in answers):
+        ok = np.array([bool(said.ok) for _, said in answers])
         row |= {"ok": int(ok.sum()), "wrong ok": int((ok & ~within[0]).sum())}
     right = errors[within[0]]
     middle = np.median(right, axis=0) if len(right) else (np.nan, np.nan)
     row |= {"rotation [deg]": float(middle[0]), "translation [m]": float(middle[1])}
-    for clock in ("wall", "cpu"):
-        row[f"{clock} [s]"] = float(np.median([said[clock] for _, said in answers]))
-    return row
+    wall, cpu = np.median([(said.wall, said.cpu) for _, said in answers], axis=0)
+    return {**row, "wall [s]": float(wall), "cpu [s]": float(cpu)}
 
 
-def _errors(one: ListedPair, said: dict) -> tuple[float, float]:
-    if said["T_dst_src"] is None:
+def _errors(one: ListedPair, said: Answer) -> tuple[float, float]:
+    if said.pose is None:
         return np.inf, np.inf
-    pose = Pose.from_matrix(np.array(said["T_dst_src"]))
-    off = tj.metrics.errors(pose, one.truth)
+    off = tj.metrics.errors(said.pose, one.truth)
     return float(off.rotation_deg), float(off.translation)
 
 

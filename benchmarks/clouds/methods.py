@@ -50,6 +50,21 @@ class Answer(NamedTuple):
     wall: float
     cpu: float
 
+    def as_row(self) -> dict[str, Any]:
+        """What JSON can hold."""
+        pose, *others = (None if x is None else _parts(x) for x in (self.pose, *self.others))
+        return {**self._asdict(), "pose": pose, "others": others}
+
+    @classmethod
+    def of_row(cls, row: dict[str, Any]) -> Answer:
+        """The answer again."""
+        pose, *others = (x and Pose(*(np.array(y) for y in x)) for x in (row["pose"], *row["others"]))
+        return cls(**{**row, "pose": pose, "others": tuple(others)})
+
+
+def _parts(pose: Pose) -> list[Any]:
+    return [np.asarray(x, np.float64).tolist() for x in (pose.rotation, pose.translation, pose.scale)]
+
 
 class Clock:
     """What a block takes, by the clock and on all cores together [s]."""

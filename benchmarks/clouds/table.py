@@ -4,23 +4,31 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import groupby
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from benchmarks.baseline import Metric
 from benchmarks.clouds.cases import FAMILIES, SCENE_NAMES, CloudPair, pairs
+from benchmarks.clouds.kept import Kept, code
 from benchmarks.clouds.methods import OURS, SILENT, Answer, asked, find_methods
 from benchmarks.clouds.rates import SHARES, Rate, rates
 from benchmarks.clouds.scenes import REPEATS, SLIDES
 from benchmarks.clouds.timing import timed
 
+RESULTS = Path(__file__).parents[1] / "results"
 WANTED = {SCENE_NAMES[SLIDES]: "DEGENERATE", SCENE_NAMES[REPEATS]: "AMBIGUOUS"}  # NO_CONSENSUS elsewhere
 
 
 def run(quick: bool) -> list[dict]:
-    """A row a kind of pairs and method, then a row a timed pair and method; a line for missing peers."""
+    """A row a kind of pairs and method, then a row a timed pair and method; a row for missing peers.
+
+    Answers are kept on the way: a run that ended goes on where it was, if the code is the same.
+    """
     methods, missing = find_methods()
+    RESULTS.mkdir(exist_ok=True)
+    kept = Kept(RESULTS / f"clouds-{code():08x}.partial.jsonl", {"code": code()})
     rows: list[dict] = [{"part": "missing", "package": k, "why": v} for k, v in missing.items()]
     asked_about = pairs(quick)
     with tqdm(total=len(asked_about), disable=None) as bar:
@@ -30,10 +38,15 @@ def run(quick: bool) -> list[dict]:
                 bar.set_description(f"{kind}: {pair.name}")
                 for name, method in methods.items():
                     if pair.truths or name not in SILENT:
-                        answers[name].append((pair, asked(method, pair)))
+                        if (key := (kind, pair.name, name)) not in kept.rows:
+                            kept.add(key, asked(method, pair).as_row())
+                        answers[name].append((pair, Answer.of_row(kept.rows[key])))
                 bar.update()
             rows += [{"part": "asked", **_row(kind, name, known)} for name, known in answers.items() if known]
-    return rows + [{"part": "timed", **row} for row in timed(quick)]
+    rows += [{"part": "timed", **row} for row in timed(quick)]
+    if not quick:
+        kept.path.unlink()
+    return rows
 
 
 def _row(kind: str, method: str, answers: list[tuple[CloudPair, Answer]]) -> dict:
