@@ -216,6 +216,7 @@ def test_what_is_wrong_with_a_log_is_said_in_one_line(indoors, capsys, text, wor
     [
         ("", "is empty"),
         ("8 0 8 7 1 0 0 0\n", "line 1: names no columns seq (or session_ind), i and j"),
+        ("seq i j\n\n", "holds no pair"),
         ("seq i j\n8 0 7 1 0 0 0\n", "line 2: expected 3 indices and 16 numbers, found 7"),
         ("seq i j\n8 0 x " + "1 " * 16, "line 2: expected 3 indices, found '8 0 x'"),
         ("seq i j\n8 0 7 " + "1 " * 16, "line 2: is no pose"),

@@ -143,6 +143,8 @@ def _table(path: Path, where: Callable[[int, int, Path], Path]) -> Iterator[List
         raise FileError(
             f"{path}: line 1: names no columns seq (or session_ind), i and j: it is no such list."
         )
+    if len(lines) == 1:
+        raise FileError(f"{path}: holds no pair.")
     start = max(k for k in columns if k is not None) + 1
     for at, words in lines[1:]:
         if len(words) < start + 16:
