@@ -23,12 +23,20 @@ NOTEBOOKS = [
         "03_certificates",
         "04_learning_through_registration",
         "05_batches_and_devices",
+        "06_two_scans",
+        "08_scan_matching",
     )
 ]
 
 
-# They register a thousand problems, train three networks, compile for four devices.
-SLOW = ("03_certificates", "04_learning_through_registration", "05_batches_and_devices")
+# They register a thousand problems, train three networks, compile for four devices, register 30 clouds.
+SLOW = (
+    "03_certificates",
+    "04_learning_through_registration",
+    "05_batches_and_devices",
+    "06_two_scans",
+    "08_scan_matching",
+)
 LONG = [pytest.param(p, marks=pytest.mark.slow) if p.stem in SLOW else p for p in NOTEBOOKS]
 
 

@@ -20,9 +20,10 @@ from teaser_jax.clouds.pair import USUAL_CELLS, Pair
 
 OURS, KISS, KISS_CELLS = "teaser_jax", "KISS-Matcher", "KISS-Matcher, our cells"
 RANSAC, FGR = "Open3D RANSAC", "Open3D FGR"
+SILENT = (RANSAC, FGR)  # they never say whether to trust a pose
 FEWEST_INLIERS = 5  # below which the examples of KISS-Matcher say that it might have failed
 FINEST, COARSER = 0.01, 0.1  # [m]: KISS-Matcher refuses cells below 5 mm, so smaller clouds are made larger
-ITERATIONS, CONFIDENCE = 1_000_000, 0.999  # of RANSAC: ten times those of Open3D's tutorial
+ITERATIONS, CONFIDENCE = 100_000, 0.999  # of RANSAC: ten times as many were right on the same pairs
 ALIKE = 0.9  # least ratio of two lengths that RANSAC takes for equal, as there
 Prepared = tuple[Any, Any]
 
@@ -48,6 +49,21 @@ class Answer(NamedTuple):
     seconds: dict[str, float]
     wall: float
     cpu: float
+
+    def as_row(self) -> dict[str, Any]:
+        """What JSON can hold."""
+        pose, *others = (None if x is None else _parts(x) for x in (self.pose, *self.others))
+        return {**self._asdict(), "pose": pose, "others": others}
+
+    @classmethod
+    def of_row(cls, row: dict[str, Any]) -> Answer:
+        """The answer again."""
+        pose, *others = (x and Pose(*(np.array(y) for y in x)) for x in (row["pose"], *row["others"]))
+        return cls(**{**row, "pose": pose, "others": tuple(others)})
+
+
+def _parts(pose: Pose) -> list[Any]:
+    return [np.asarray(x, np.float64).tolist() for x in (pose.rotation, pose.translation, pose.scale)]
 
 
 class Clock:

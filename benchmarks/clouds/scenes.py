@@ -111,7 +111,7 @@ def _flat() -> Iterator[Scene]:
 
         return draw
 
-    yield Scene(REPEATS, "corrugated sheet, three waves on", wave(0), wave(2.4), 0.004)
+    yield Scene(SLIDES, "corrugated sheet, three waves on", wave(0), wave(2.4), 0.004)
 
 
 def revolved(radius: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> Draw:
