@@ -86,36 +86,27 @@ def find_rivals(
     points, cell = here.points[chosen], dst.voxel_size
     weight = here.weight[chosen] / here.weight[chosen].sum()
     asked = chosen[np.random.default_rng(0).choice(len(chosen), ASKED, p=weight)]
-    motions = np.concatenate(
-        [
-            alternatives(points, here.normals[chosen], seen, cell),
-            np.reshape([other @ np.linalg.inv(pose) for other in others], (-1, 4, 4)),
-        ]
-    )
-    some = points[:: max(1, len(points) // 500)]
-    apart = lambda motion: np.linalg.norm(moved(motion, some) - some, axis=1).mean()
-    motions = motions[[apart(motion) >= DIFFERENT * cell for motion in motions]]
+    motions = alternatives(points, here.normals[chosen], seen, cell)
+    poses = np.concatenate([motions @ pose, np.reshape(others, (-1, 4, 4))])
+    some = src.points[chosen[:: max(1, len(chosen) // 500)]]
+    apart = lambda one, other: np.linalg.norm(moved(one, some) - moved(other, some), axis=1).mean()
+    poses = poses[[apart(pose, other) >= DIFFERENT * cell for other in poses]]
     if guess is not None:
-        there = moved(guess.pose @ np.linalg.inv(pose), some)  # where the guess has the points
-        astray = lambda motion: np.linalg.norm(moved(motion, some) - there, axis=1).mean()
-        motions = motions[[astray(motion) <= guess.error for motion in motions]]
-    if len(motions) == 0:
+        poses = poses[[apart(guess.pose, other) <= guess.error for other in poses]]
+    if len(poses) == 0:
         return NONE
     every = chosen[:: max(1, len(chosen) // ALIGNED_CELLS)]
     fitting = Surface(src.points[every], cell, threads=src.threads)  # what another pose has to explain
-    quick = _screened(motions @ pose, src, dst, asked)
+    quick = _screened(poses, src, dst, asked)
     found = Rivals(min(float(quick.max()), WORTH_A_TRY), 0.0, NONE.lead, ())
-    for other in possible(motions @ pose, quick, laid, images):
+    for other in possible(poses, quick, laid, images):
         aligned = align(align(other, fitting, dst, reach=4.0), fitting, dst)
-        if (
-            apart(aligned @ np.linalg.inv(pose)) >= DIFFERENT * cell
-        ):  # else it fell back: judge where it stood
+        if apart(pose, aligned) >= DIFFERENT * cell:  # else it fell back: judge it where it stood
             other = aligned
         share = _share(pair(other, src, dst, asked), ASKED // 2)
-        found = found._replace(
-            lead=found.lead.at_worst(lead(laid, other)),
-            poses=(*found.poses, other) if share > LIKE else found.poses,
-        )
+        found = found._replace(lead=found.lead.at_worst(lead(laid, other)))
+        if share > LIKE and all(apart(x, other) >= DIFFERENT * cell for x in found.poses):
+            found = found._replace(poses=(*found.poses, other))
         if share > found.equal or found.fit == 0:
             found = found._replace(equal=share, fit=lay(other, src, dst).fit)
     return found
