@@ -134,7 +134,7 @@ def test_pairs_are_kept_exactly():
     assert (back.status, back.displacement, back.i, back.j) == (pair.status, pair.displacement, 1, 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_workers_share_the_pairs_and_change_no_answer(found, folder: Path, tmp_path: Path):
     result, _ = found
     paths = [folder / name for name in result.names]
@@ -152,7 +152,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_work_goes_on_after_a_kill(found, folder: Path, tmp_path: Path, monkeypatch):
     result, _ = found
     paths = [folder / name for name in result.names]

@@ -79,7 +79,9 @@ def test_limits_are_chosen_so_that_no_wrong_answer_is_ok():
     assert by_folds(rows) == [row["right"] for row in rows]
     counted = rates(rows, by_folds(rows))
     assert (counted.right.hits, counted.wrong.hits, counted.wrong.of, counted.none.of) == (20, 0, 20, 0)
-    assert "0 of  20" in report(rows)
+    written = report(rows, 10)
+    assert "| all | 10 of 20 | 10 of 10 (> 74%) | 0 of 10 (< 26%)" in written
+    assert written.count("\n## ") == 3
 
 
 def test_a_row_without_evidence_is_not_ok():
@@ -88,9 +90,7 @@ def test_a_row_without_evidence_is_not_ok():
 
 def test_a_run_goes_on_where_it_ended(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        "benchmarks.verdict.record.pairs", lambda count, first: [_Named("a"), _Named("b")][:count]
-    )
+    monkeypatch.setattr("benchmarks.verdict.record.pairs", lambda count: [_Named("a"), _Named("b")][:count])
     monkeypatch.setattr(
         "benchmarks.verdict.record._row",
         lambda pair, viewpoints: asked.append(pair.name) or {"name": pair.name},

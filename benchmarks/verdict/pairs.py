@@ -54,10 +54,10 @@ class Pair(NamedTuple):
         return float(np.linalg.norm(pose.apply(points) - self.truth.apply(points), axis=1).mean())
 
 
-def pairs(count: int, first: int = 0) -> Iterator[Pair]:
-    """All pairs of so many places of each kind, from a number on."""
+def pairs(count: int) -> Iterator[Pair]:
+    """All pairs of so many places of each kind."""
     last: dict[str, Place] = {}
-    for place in places(count, first):
+    for place in places(count):
         for i, j in combinations(range(len(place.scans)), 2):
             yield _pair(place, place, i, j, thin=(i + j + place.seed) % 4 == 0)
         if place.kind in last:

@@ -128,9 +128,9 @@ KINDS: dict[str, Callable[[np.random.Generator], Iterator[Scan]]] = {
 }  # fmt: skip
 
 
-def places(count: int, first: int = 0) -> Iterator[Place]:
-    """So many places of each kind, from a number on, one kind after the other each time."""
-    for seed in range(first, first + count):
+def places(count: int) -> Iterator[Place]:
+    """So many places of each kind, one kind after the other each time."""
+    for seed in range(count):
         for number, (kind, draw) in enumerate(KINDS.items()):
             yield Place(kind, seed, tuple(draw(np.random.default_rng((seed, number)))))
 

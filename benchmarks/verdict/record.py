@@ -13,19 +13,18 @@ import teaser_jax as tj
 from benchmarks.verdict.pairs import RIGHT, Pair, pairs
 
 
-def record(path: Path, count: int, *, first: int = 0, viewpoints: bool) -> list[dict[str, Any]]:
+def record(path: Path, count: int, *, viewpoints: bool) -> list[dict[str, Any]]:
     """Register all pairs of so many places of each kind, but for those that the file has already.
 
     Args:
         path: A line of JSON for each pair.
         count: Places of each kind.
-        first: The number of the first of them.
         viewpoints: Whether to tell where the sensors stood.
     """
     rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     done = {row["name"] for row in rows}
     with path.open("a") as file:
-        for pair in tqdm(pairs(count, first), unit="pair", disable=None):
+        for pair in tqdm(pairs(count), unit="pair", disable=None):
             if pair.name not in done:
                 rows.append(_row(pair, viewpoints))
                 file.write(json.dumps(rows[-1]) + "\n")
