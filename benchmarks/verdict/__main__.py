@@ -17,11 +17,11 @@ from teaser_jax.clouds.trust.judge import LIMITS
 REPORT = Path(__file__).parent.parent / "VERDICT.md"
 HEAD = """# What `ok` of two raw clouds is worth
 
-Made by `python -m benchmarks.verdict`: made-up rooms, corridors, streets, halls, hills and solids, each scanned
-three times; every pair of scans of one place, and a pair of scans of two places. An answer is right if it
+Made by `python -m benchmarks.verdict`: made-up rooms, corridors, streets, halls, hills and solids, each
+scanned three times; every pair of scans of one place, and a pair of two places. An answer is right if it
 displaces the overlap by less than two voxels. Numbers in brackets are limits with 95 % confidence: the true
-rate is above the first and below the others. Where scans of a place hardly overlap, or see corners of an empty
-room, no one can tell, and few answers are right.
+rate is above the first and below the others. Where scans of a place hardly overlap, or see corners of empty
+rooms, no one can tell, and few answers are right.
 """
 HEADINGS = "| places | right answers | ok, given a right one | given a wrong one | given none |"
 

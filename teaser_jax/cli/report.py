@@ -100,6 +100,7 @@ def clouds_as_plain_data(result: CloudRegistration) -> dict[str, Any]:
             "overlap": _plain(e.overlap),
             "support": _plain(e.support),
             "in_front": _plain(e.in_front),
+            "beyond_planes": _plain(e.beyond_planes),
             "residual": _plain(e.residual),
             "visible": _plain(e.seen.visible),
             "explained_by_another": _plain(e.rivals.equal),
