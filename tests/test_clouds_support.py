@@ -78,6 +78,12 @@ def test_one_pose_many_and_traced_ones_have_the_same_numbers(clouds, found):
         np.testing.assert_array_equal(getattr(grid, name), every.reshape(2, 3, *every.shape[1:]))
 
 
+def test_clouds_may_be_read_inside_jit():
+    a, b = terrain(0, 5_000), terrain(1, 5_000)  # nothing is known of them yet
+    traced = jax.jit(lambda pose: support(pose, a, b).fit)(np.eye(4, dtype=np.float32))
+    np.testing.assert_allclose(traced, support(np.eye(4), a, b).fit, atol=5e-3)
+
+
 def test_lengths_are_those_of_the_clouds():
     a, b = terrain(0, 5_000), terrain(1, 5_000)
     small, large = support(np.eye(4), a, b), support(np.eye(4), 1000 * a, 1000 * b)
@@ -154,6 +160,8 @@ def test_refuses_what_is_no_pose(clouds):
         support(np.eye(3), *clouds)
     with pytest.raises(ValueError, match="scale"):
         support(np.diag([2.0, 2, 2, 1]), *clouds)
+    with pytest.raises(ValueError, match="one number"):
+        support(np.eye(4), *clouds, voxel_size=[0.1])
     with pytest.raises(ValueError, match="prepared"):
         support(np.eye(4), *clouds, src_viewpoint=EYE)
     with pytest.raises(ValueError, match="inside jit"):

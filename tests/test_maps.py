@@ -299,3 +299,13 @@ def test_the_command_says_what_is_wrong_in_one_line(tmp_path: Path, capsys, chan
     assert out == ""
     assert words in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("options", [["--merged", "b.ply"], ["-o", "b.ply"], ["--merged", "new.ply"]])
+def test_nothing_is_written_among_the_scans(tmp_path: Path, capsys, options):
+    for name in ("a", "b", "c"):
+        write_cloud(tmp_path / f"{name}.ply", STRIPS[0])
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert cli.main(["map", str(tmp_path), options[0], str(tmp_path / options[1])]) == 2
+    assert "lies among the scans" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

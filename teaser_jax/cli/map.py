@@ -38,7 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
         FileError: If a file cannot be used.
     """
     output, merged = arguments.output, arguments.merged
-    paths = clouds_in(arguments.folder, {path for path in (output, merged) if path is not None})
+    paths = clouds_in(arguments.folder)
+    for path in (output, merged):
+        _check_apart(path, arguments.folder)
     check_places(paths, {"output": output, "merged": merged})
     result = _answer(arguments, paths)
     older = output is not None and output.exists()
@@ -52,10 +54,10 @@ def run(arguments: argparse.Namespace) -> int:
     return OK if result.ok else UNTRUSTED
 
 
-def clouds_in(folder: Path, written: set[Path]) -> list[Path]:
+def clouds_in(folder: Path) -> list[Path]:
     """List the clouds of a folder in the natural order of their names: scan2 before scan10.
 
-    Text is left out beside clouds of other kinds, as poses and times lie there, and so is what is written.
+    Text is left out beside clouds of other kinds, as poses and times lie there.
 
     Raises:
         BadInput: If it is no folder, or holds fewer than two clouds.
@@ -66,8 +68,7 @@ def clouds_in(folder: Path, written: set[Path]) -> list[Path]:
         raise BadInput(f"{folder}: is no folder: give that of the clouds; register takes two files")
     with failures_named(folder):
         found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
-    theirs = {path.resolve() for path in written}
-    found = [x for x in found if x.resolve() not in theirs and not x.name.startswith(".")]
+    found = [path for path in found if not path.name.startswith(".")]
     others = [path for path in found if SUFFIXES[path.suffix.lower()] != "text"]
     found = others or found
     if len(found) < 2:
@@ -77,6 +78,14 @@ def clouds_in(folder: Path, written: set[Path]) -> list[Path]:
         )
     numbers = lambda name: [(0, int(x), "") if x.isdecimal() else (1, 0, x) for x in re.split(r"(\d+)", name)]
     return sorted(found, key=lambda path: (numbers(path.name), path.name))
+
+
+def _check_apart(path: Path | None, folder: Path) -> None:
+    """Raise BadInput if what is written would be a scan to the next run, or takes the place of one."""
+    if path is None or path.suffix.lower() not in SUFFIXES:
+        return
+    if path.resolve().parent == folder.resolve():
+        raise BadInput(f"{path}: lies among the scans, and would be taken for one: name another folder")
 
 
 def _answer(arguments: argparse.Namespace, paths: list[Path]) -> tj.CloudMap:

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from teaser_jax.files.clouds import read_cloud
-from teaser_jax.ground.checks import check_positive
-from teaser_jax.reading import coordinates_of, real_numbers
+from teaser_jax.reading import coordinates_of, positive_number, real_numbers
 
 FEWEST = 100  # points of which a shape can be told
 # Strays lie further outside the box of the middle 98 % of the points than that box is long.
@@ -156,7 +155,7 @@ def _outside(
             raise ValueError("crop: expected the lower and the upper corner of a box, (2, 3) numbers.")
         gone |= ((points < box[0]) | (points > box[1])).any(axis=1)
     if max_range is not None:
-        check_positive(max_range=max_range)
+        positive_number(max_range, "max_range")
         gone |= np.sum((points - (0 if eye is None else eye)) ** 2, axis=1) > max_range**2
     return gone
 

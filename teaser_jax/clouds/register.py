@@ -23,10 +23,10 @@ from teaser_jax.clouds.trust.judge import CELLS, Judged, Verdict, judge
 from teaser_jax.clouds.trust.pairing import moved
 from teaser_jax.clouds.trust.rivals import Guess
 from teaser_jax.ground.arrays import AnyArray, inside_jit, is_traced
-from teaser_jax.ground.checks import check_positive, one_of
+from teaser_jax.ground.checks import one_of
 from teaser_jax.ground.flags import as_on_the_host
 from teaser_jax.pose import Pose, as_pose
-from teaser_jax.reading import known_scale, real_numbers
+from teaser_jax.reading import known_scale, positive_number, real_numbers
 from teaser_jax.solution import Status
 
 MATCHES_AGAIN = ("fit", "space", "own")  # doubts that other matches may dispel
@@ -99,7 +99,9 @@ def register_clouds(
     if inside_jit() or is_traced(src, dst):
         raise ValueError(INSIDE_JIT)
     given = dict(voxel_size=voxel_size, tolerance=tolerance, initial_error=initial_error, seconds=seconds)
-    check_positive(**{name: value for name, value in given.items() if value is not None})
+    for name, value in given.items():
+        if value is not None:
+            positive_number(value, name)
     if refine is not None:
         one_of("refine", refine, ("gicp", "plane"))
     if initial is None and initial_error is not None:

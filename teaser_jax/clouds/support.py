@@ -20,8 +20,8 @@ from teaser_jax.clouds.trust.pairing import NEAR, compared, direction_weights
 from teaser_jax.clouds.trust.space import sight
 from teaser_jax.clouds.trust.table import Table, nearest_cell, table_of
 from teaser_jax.ground.arrays import AnyArray, as_array, is_traced
-from teaser_jax.ground.checks import check_positive
 from teaser_jax.pose import Pose
+from teaser_jax.reading import positive_number
 
 AT_ONCE = 16  # poses side by side
 
@@ -88,14 +88,15 @@ def support(
     if is_traced(src, dst):
         raise ValueError("support reads clouds on the host: inside jit and vmap only poses may be traced.")
     if voxel_size is not None:
-        check_positive(voxel_size=voxel_size)
+        positive_number(voxel_size, "voxel_size")
     matrix = _matrices(pose)
     one = partial(as_prepared, threads=threads_or_all(threads))
-    clouds = one(src, "src", viewpoint=src_viewpoint), one(dst, "dst", viewpoint=dst_viewpoint)
-    pair = Pair(*clouds, voxel_size=voxel_size)
-    surfaces = pair.surfaces(CELLS, MOST_CELLS)
+    with jax.ensure_compile_time_eval():  # clouds are read at once, also where poses are traced
+        clouds = one(src, "src", viewpoint=src_viewpoint), one(dst, "dst", viewpoint=dst_viewpoint)
+        pair = Pair(*clouds, voxel_size=voxel_size)
+        surfaces = pair.surfaces(CELLS, MOST_CELLS)
+        tables = [table_of(x, image) for x, image in zip(surfaces, pair.images, strict=True)]
     cell = surfaces[1].voxel_size
-    tables = [table_of(x, image) for x, image in zip(surfaces, pair.images, strict=True)]
     rotation = matrix[..., :3, :3]
     shift = so3.rotate(rotation, pair.src.cloud.origin[None])[..., 0, :] - pair.dst.cloud.origin
     flat = jnp.asarray(rotation.reshape(-1, 3, 3), jnp.float32)

@@ -144,6 +144,6 @@ def _on_a_cycle(
     without.remove_edges_from([tuple(ends) for ends in bridges])
     found = np.zeros(len(placed), bool)
     parts = sorted((sorted(part) for part in nx.connected_components(without)), key=lambda x: (-len(x), x))
-    if parts:
+    if parts and len(parts[0]) > 1:
         found[parts[0]] = True
     return found

@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from teaser_jax.clouds.prepared import Prepared
-from teaser_jax.ground.checks import check_positive, shown, whole_number
+from teaser_jax.ground.checks import shown, whole_number
 from teaser_jax.maps.chosen import NEXT, pairs_to_ask
 from teaser_jax.maps.graph import Engine, engine_or_any
 from teaser_jax.maps.placing import place
@@ -20,6 +20,7 @@ from teaser_jax.maps.result import CloudMap
 from teaser_jax.maps.shelf import Reading, Shelf, named
 from teaser_jax.maps.store import open_store
 from teaser_jax.maps.work import Job, done_pairs
+from teaser_jax.reading import positive_number
 
 
 def register_many(
@@ -78,7 +79,9 @@ def register_many(
     values = _checked(clouds, viewpoint=viewpoint, crop=crop, max_range=max_range)
     whole_number("workers", workers, 1, what="how many processes share the pairs")
     given = dict(seconds=seconds, voxel_size=voxel_size, tolerance=tolerance)
-    check_positive(**{name: value for name, value in given.items() if value is not None})
+    for name, value in given.items():
+        if value is not None:
+            positive_number(value, name)
     engine = engine_or_any(engine)
     reading = Reading(viewpoint, crop, max_range, threads)
     shelf = Shelf(values, named(values, names), reading)
