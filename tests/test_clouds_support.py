@@ -160,8 +160,8 @@ def test_refuses_what_is_no_pose(clouds):
         support(np.eye(3), *clouds)
     with pytest.raises(ValueError, match="scale"):
         support(np.diag([2.0, 2, 2, 1]), *clouds)
-    with pytest.raises(ValueError, match="one number"):
-        support(np.eye(4), *clouds, voxel_size=[0.1])
+    with pytest.raises(ValueError, match="above 0"):
+        support(np.eye(4), *clouds, voxel_size=0.0)
     with pytest.raises(ValueError, match="prepared"):
         support(np.eye(4), *clouds, src_viewpoint=EYE)
     with pytest.raises(ValueError, match="inside jit"):
