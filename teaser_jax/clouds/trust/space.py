@@ -107,13 +107,12 @@ def in_front(
         src, dst: The surfaces.
         images: What the sensors of the source and of the target saw; None: not known.
     """
-    ways = (images[1], moved(pose, src.points)), (images[0], moved(np.linalg.inv(pose), dst.points))
-    every = (np.ones(len(points), bool) for _, points in ways)
-    found = [
-        float(sight(image, points, mask, NEAR * dst.voxel_size).in_front)
-        for (image, points), mask in zip(ways, every, strict=True)
-        if image is not None
-    ]
+    found = []
+    for image, way, surface in ((images[1], pose, src), (images[0], np.linalg.inv(pose), dst)):
+        if image is not None:
+            points = moved(way, surface.points)
+            seen = sight(image, points, np.ones(len(points), bool), NEAR * dst.voxel_size)
+            found.append(float(seen.in_front))
     return max((x for x in found if not np.isnan(x)), default=np.nan)
 
 
